@@ -539,10 +539,19 @@ def _lines(full: Problem, fits: FullRate) -> list[Finding]:
 
 
 def _fed_back(problem: Problem) -> list[Finding]:
-    """A sentence where effects were not tried because a controller fed the noise of the motion back into the input."""
+    """A sentence where effects were not tried because the residual is noise of the motion, which a law with memory cancels:
+    a controller fed it back into the input, or the nominal law passes it on.
+    """
+    names = [problem.columns.get(name, name) for name in problem.model.quiet_inputs]
+    if problem.noise_passed > problem.rules.noise_passed_share and not problem.noise_fed:
+        says = (
+            f"The noise of column {names[0]} makes most of the residual, through the nominal law. No delay, lag, resonance "
+        )
+        says += "or second mass was tried: a law with memory can cancel this noise, so these recordings cannot show one. "
+        says += "Read the motion with less noise, or record slower motions."
+        return [Finding("noise_passed_on", names[0], says)]
     if not problem.noise_fed:
         return []
-    names = [problem.columns.get(name, name) for name in problem.model.quiet_inputs]
     says = f"A controller computes column {names[0]} from the recorded motion, whose noise is most of the residual. No "
     says += "delay, lag, resonance or second mass was tried: a law with memory can cancel this noise, so these recordings "
     says += "cannot show one. Record in open loop, or read the motion with less noise."

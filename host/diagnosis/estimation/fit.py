@@ -81,6 +81,7 @@ class Problem:
     budget: Budget = field(default_factory=Budget)
     joint_states: bool = False  # whether parameters and initial states are fitted together: the model is a linear path
     noise_fed: bool = False  # the residual is mostly noise that a controller fed back (`find_feedback`)
+    noise_passed: float = 0.0  # share of the residual's variance that is noise of measured inputs, through the nominal law
     waits_s: float = 0.0  # time from the first sample on that is left out at least, while a dead time is fitted
     ends_s: float = 0.0  # and before the last one, while the drift of a clock is
 

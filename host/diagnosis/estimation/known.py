@@ -116,6 +116,10 @@ class Known(Model):
         """Call the model without the known effects."""
         self._inner.settle(segment, theta[: self.own])
 
+    def noise_of_inputs(self, segment: Segment, theta: Array) -> Array:
+        """Call the model without the known effects."""
+        return self._inner.noise_of_inputs(segment, theta[: self.own])
+
     def noise_of(self, segment: Segment) -> Any:
         """Call the model without the known effects."""
         return self._inner.noise_of(segment)

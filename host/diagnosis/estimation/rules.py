@@ -45,6 +45,9 @@ class SelectionRules:
     quietest_share: float = 0.05  # part of the spectrum that is taken for noise where nothing rests
 
     # Noise that a controller feeds back into its input.
+    noise_passed_share: float = 0.5  # of the residual's variance that is noise of measured inputs, above which effects that
+    # could cancel it are not tried; elsewhere they have to remove
+    noise_passed_margin: float = 1.5  # so many times that share, which is estimated
     feedback_share: float = 0.05  # of the residual's variance that later input has to predict, beyond chance,
     feedback_over_past: float = 2.0  # and over what earlier input predicts: that is a wrong model
     feedback_over_remainder: float = 2.0  # least ratio of the coefficients on the new part of the input and on the other

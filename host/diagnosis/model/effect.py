@@ -174,6 +174,11 @@ class Effect:
     invariant: bool = False  # linear and time-invariant: before or behind a linear plant it does the same
     affine: bool = False  # a reading times a constant plus a constant: a state that is read begins elsewhere with it
 
+    @property
+    def cancels_noise(self) -> bool:
+        """Whether it is a linear law with memory, which can take away noise of its input."""
+        return self.filters or self.invariant or bool(self.shifts)
+
 
 @dataclass(frozen=True)
 class Port:

@@ -165,6 +165,10 @@ class Model(ABC):
         """Noise (`estimation.noise.Noise`) of a difference that the model itself makes; None: estimated from the output."""
         return None
 
+    def noise_of_inputs(self, segment: Segment, theta: Array) -> Array:
+        """Standard deviation (outputs,) of what the noise of measured inputs makes of the outputs, where it is known."""
+        return np.zeros(len(self.outputs))
+
     def sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect]) -> Array:
         """Change of outputs (outputs, n) per change of the signal at port `axis`, of a model that is `pointwise`."""
         raise NotImplementedError(f"{self.kind}: outputs do not answer sample by sample")

@@ -382,8 +382,10 @@ def least_error_window(x: Array, dt_s: float, sigma: float, degree: int, order: 
     """Samples (odd) of the local polynomial whose derivative of `order` of the motion `x` (n,) has the least squared error:
     what it takes from the motion, and what it passes of white noise `sigma`.
 
-    The motion's spectrum is the part of its periodogram above three times that of the noise. A window that is set by the
-    band alone takes 1 to 5 % of what lies at the band's edge; times the stiffness, that may exceed the noise of a force.
+    The motion's spectrum is the part of its periodogram that noise alone exceeds at one frequency in 20 recordings: three
+    times the noise, which it exceeds at one frequency in 20, would count noise at high frequencies as motion, times the
+    fourth power of the frequency in an acceleration. A window that is set by the band alone takes 1 to 5 % of what lies at
+    the band's edge; times the stiffness, that may exceed the noise of a force.
     """
     from scipy.signal import savgol_coeffs
 
@@ -391,7 +393,8 @@ def least_error_window(x: Array, dt_s: float, sigma: float, degree: int, order: 
     line = np.polynomial.polynomial.polyfit(np.arange(x.size), x, 1)
     power = np.abs(np.fft.rfft((x - np.polynomial.polynomial.polyval(np.arange(x.size), line)) * taper)) ** 2
     noise = sigma * sigma * float(taper @ taper)
-    signal = np.where(power > 3.0 * noise, power - noise, 0.0) * 2.0 / (x.size * float(taper @ taper))
+    least = noise * (3.0 + math.log(power.size))  # a periodogram of noise is exponential, and exp(-3) is one in 20
+    signal = np.where(power > least, power - noise, 0.0) * 2.0 / (x.size * float(taper @ taper))
     exact = (2j * np.pi * np.fft.rfftfreq(x.size, dt_s)) ** order
     errors = {}
     for half in np.unique(np.geomspace((degree + 2) // 2 + 1, max(x.size // 16, degree), 24).astype(int)):

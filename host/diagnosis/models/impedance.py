@@ -120,6 +120,13 @@ class ImpedanceModel(Model):
         force = force + force_along(segment.moved, here, segment, port, float(stiffness))
         return np.asarray(apply_effects(force, active, f"{self.spec.subsystem}_reading", segment, None))[None, :]
 
+    def noise_of_inputs(self, segment: Segment, theta: Array) -> Array:
+        """Force (1,) that the noise of the motion makes through the law."""
+        assert isinstance(segment, MovedSegment)
+        law = {term: float(value) for (term, _), value in zip(self.terms, theta, strict=True)}
+        coefficients = (law.get("stiffness", 0.0), law.get("damping", 0.0), law.get("mass", 0.0))
+        return np.array([segment.moved.noise_of_force(coefficients, segment.recording.dt_s)])
+
     def motion(self, segment: Segment, port: Port) -> Array:
         """The measured motion, or the measured force for the reading port."""
         if port.name == self.spec.subsystem:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import savgol_coeffs
 
 from host.diagnosis.estimation.noise import estimate, quiescent
 from host.diagnosis.model.dataset import Recording
@@ -23,12 +24,18 @@ CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is take
 
 @dataclass(frozen=True)
 class Moved:
-    """A measured motion with its derivatives, each (n,), and the movement below which nothing has moved."""
+    """A measured motion with its derivatives, each (n,), and the movement below which nothing has moved.
+
+    noise: standard deviation of what was read of it; windows: samples that x, v and a are each smoothed over, 1 for an x
+    that is taken as it is.
+    """
 
     x: Array
     v: Array
     a: Array
     tolerance: float
+    noise: float = 0.0
+    windows: tuple[int, int, int] = (1, 1, 1)
 
     @classmethod
     def of(cls, motion: Array, recording: Recording) -> Moved:
@@ -46,7 +53,18 @@ class Moved:
             windows = [max(min(one, widest), least) for one in best]
         x, v, a = (smooth_derivatives(motion, recording.dt_s, one, DEGREE)[k] for k, one in enumerate(windows))
         # smoothing a clean motion would round its reversals, and friction with them
-        return cls(motion if clean else x, v, a, tolerance)
+        taken = (1 if clean else windows[0], windows[1], windows[2])
+        return cls(motion if clean else x, v, a, tolerance, noise, taken)
+
+    def noise_of_force(self, law: tuple[float, float, float], dt_s: float) -> float:
+        """Standard deviation of the force that the noise of the motion makes through stiffness, damping and mass (`law`)."""
+        longest = max(self.windows)
+        answer = np.zeros(longest)
+        for order, (window, weight) in enumerate(zip(self.windows, law, strict=True)):
+            kernel = np.ones(1) if window == 1 else savgol_coeffs(window, DEGREE, deriv=order, delta=dt_s, use="dot")
+            first = (longest - window) // 2
+            answer[first : first + window] += weight * kernel
+        return self.noise * float(np.sqrt(np.sum(answer**2)))
 
 
 def force_along(moved: Moved, here: list[ActiveEffect], segment: Segment, port: str, stiffness: float = 0.0) -> Array:

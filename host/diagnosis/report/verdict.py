@@ -20,7 +20,7 @@ from host.diagnosis.selection.locate import joined
 from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
 # Findings on what these data cannot decide, the most important one first.
-UNDECIDED = ("line", "noise_fed_back", "slow_noise", "noise_unseen", "within_sample", "excitation")
+UNDECIDED = ("line", "noise_fed_back", "noise_passed_on", "slow_noise", "noise_unseen", "within_sample", "excitation")
 REMARKS = ("outliers", "quantized", "hold", "repeated", "session", *UNDECIDED)  # findings that ask for no change of the data
 
 

@@ -221,7 +221,7 @@ def screen(
     resting = _resting(problem)
     for count, candidate in enumerate(candidate_effects):
         progress("screening", count / len(candidate_effects))
-        if problem.noise_fed and (candidate.effect.invariant or candidate.effect.filters or candidate.effect.shifts):
+        if candidate.effect.cancels_noise and (problem.noise_fed or problem.noise_passed > problem.rules.noise_passed_share):
             continue
         drop = replaced_by(fit, candidate)
         if drop is None or (candidate.port.name in resting and not candidate.effect.at_rest and not candidate.source):

@@ -155,7 +155,19 @@ def fit_nominal(problem: Problem) -> Fit:
     fit = settled(problem, begun_again(problem, fit))
     fed = find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs, problem.rules)
     problem.noise_fed = fed and _at_noise(problem, fit)
+    problem.noise_passed = _of_inputs(problem, fit)
     return fit
+
+
+def _of_inputs(problem: Problem, fit: Fit) -> float:
+    """Share of the residual's variance that noise of measured inputs makes through the nominal law, in the output where that
+    is most.
+    """
+    residual, passed = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
+    for segment, r in zip(problem.segments, fit.residuals, strict=True):
+        residual += np.nansum(r**2, axis=1)
+        passed += np.sum(np.isfinite(r), axis=1) * problem.model.noise_of_inputs(segment, fit.values) ** 2
+    return float(np.max(np.minimum(passed / np.maximum(residual, 1e-300), 1.0)))
 
 
 def _at_noise(problem: Problem, fit: Fit) -> bool:
@@ -206,6 +218,8 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
         problem.segments[0].recording.dt_s,
         problem.rules,
         problem.apart,
+        any(segment.repeats for segment in problem.segments),
+        problem.noise_passed if fit.terms[-1].candidate.effect.cancels_noise else 0.0,
     )
 
 

@@ -31,6 +31,8 @@ class Trial:
     period_s: float = 0.0
     rules: SelectionRules = RULES
     apart: bool = True  # whether whole recordings are held out, not blocks between the fitted ones
+    seldom: bool = False  # whether a sensor is read more seldom than it is logged
+    cancelled: float = 0.0  # share of the residual's variance that is noise which the effect could cancel
     crossed: Gain | None = None  # of all recordings, each predicted from the others, where those held out show nothing
 
 
@@ -174,8 +176,9 @@ def of_sampling(trial: Trial) -> bool:
     recorded, which is not physics: it is within a sample, and no time between those that this could take.
 
     An input that is held where it should run straight is half a sample late, one that is recorded after its sample a whole
-    one, and an integrator of a few steps in a sample a small part of one. A delay d that gains the log-likelihood L over
-    none has about the standard deviation d / sqrt(2 L): L is a parabola in d.
+    one, and an integrator of a few steps in a sample a small part of one. A sensor that is read more seldom than it is
+    logged adds any part of a sample. A delay d that gains the log-likelihood L over none has about the standard deviation
+    d / sqrt(2 L), since L is a parabola in d.
     """
     shift, rules = trial.candidate.effect.shifts, trial.rules
     if not shift or not trial.candidate.port.held:
@@ -185,8 +188,8 @@ def of_sampling(trial: Trial) -> bool:
     own = zip(term.parameters, trial.fit.values_of(term), strict=True)
     late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
     late = late_s / trial.period_s
-    if late > rules.sampling_delay:
-        return False
+    if late > rules.sampling_delay or trial.seldom:
+        return late <= rules.sampling_delay
     spread = late / math.sqrt(2.0 * max(trial.both.log_likelihood, 0.5))
     margin = max(rules.sampling_delay_margin, rules.sampling_delay_deviations * spread)
     return late < rules.integrator_delay + margin or min(abs(late - 0.5), abs(late - 1.0)) < margin
@@ -240,7 +243,7 @@ def good_enough(trial: Trial, base: Fit) -> bool:
 
 def called_for(trial: Trial, base: Fit) -> bool:
     """Whether the evidence of a trial is enough, wherever its parameters ended."""
-    if refuted(trial.heldout, trial.rules):
+    if refuted(trial.heldout, trial.rules) or trial.both.share < trial.rules.noise_passed_margin * trial.cancelled:
         return False
     more = max(trial.fit.fitted - base.fitted, 0)
     if trial.crossed is not None and _across(trial, trial.crossed, more):

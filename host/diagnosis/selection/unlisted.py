@@ -118,7 +118,7 @@ def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress:
         past = _past(problem, found, late, noise_sd)
         if not past.sure:
             return past
-    places = predict_residual(problem, found.best, noise_sd)
+    places = _places(problem, found, noise_sd)
     remainder = _remainder(problem, found, noise_sd, places)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
     if (
@@ -148,7 +148,13 @@ def _past(problem: Problem, found: Found, late: Trial, noise_sd: Array) -> Remai
 
 def remainder_of(problem: Problem, found: Found, noise_sd: Array) -> Remainder:
     """Return what the best model leaves, without a search for its equation."""
-    return _remainder(problem, found, noise_sd, predict_residual(problem, found.best, noise_sd))
+    return _remainder(problem, found, noise_sd, _places(problem, found, noise_sd))
+
+
+def _places(problem: Problem, found: Found, noise_sd: Array) -> list[PredictedPart]:
+    """What forms of the inputs predict of the residual; nothing where most of it is noise, which these inputs hold."""
+    of_noise = problem.noise_passed > problem.rules.noise_passed_share and not found.best.terms
+    return [] if of_noise else predict_residual(problem, found.best, noise_sd)
 
 
 def _remainder(problem: Problem, found: Found, noise_sd: Array, places: list[PredictedPart]) -> Remainder:
