@@ -22,7 +22,7 @@ from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
-from host.diagnosis.estimation.uncertainty import intervals, uncertain
+from host.diagnosis.estimation.uncertainty import idle_inputs, intervals, uncertain
 from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording, load, read_tables, thin
@@ -283,6 +283,7 @@ def _diagnosed(
         *_fed_back(problem),
         *_repeated(full),
         *between,
+        *idle_inputs(problem, found.best),
         *uncertain(problem, found.best, spans),
         *model.findings(),
     ]

@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from host.diagnosis.estimation.evidence import correlation_time
+from host.diagnosis.estimation.evidence import compare, correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, answers_to_begin, free, jacobian, size_of
+from host.diagnosis.model.effect import Parameter
 from host.diagnosis.model.findings import Finding
 
 Array = npt.NDArray[np.float64]
@@ -35,10 +36,14 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     base = problem.stacked(fit.terms, fit.values)
     by_begin, known = _by_begin(problem, fit, base)
     rates = jacobian(problem, fit.terms, fit.values, base, sizes)
-    J, prior = np.column_stack([rates, by_begin]), np.diag(np.concatenate((np.zeros(rates.shape[1]), known)))
+    J = np.column_stack([rates, by_begin])
+    level, bounds = _level(base), _by_bounds(problem, parameters, sizes, base)
+    prior = np.diag(np.concatenate((bounds, known)))
     inverse = _inverse(J.T @ J + prior)
     quantile = float(stats.norm.ppf(0.5 + 0.5 * level))
-    even = np.sqrt(np.maximum(np.diag(inverse @ _coloured(problem, J, base) @ inverse), 0.0))
+    # What is said by bounds alone varies as they do: a direction that no data show is as wide as they are.
+    scores = _coloured(problem, J, base) + level * np.diag(np.concatenate((bounds, np.zeros(known.size))))
+    even = np.sqrt(np.maximum(np.diag(inverse @ scores @ inverse), 0.0))
     spread, freedom = _jackknife(_blocks(problem, J, base), prior)
     fine = np.maximum(quantile * even, stats.t.ppf(0.5 + 0.5 * level, freedom) * spread)
     coarse, count = _across_recordings(problem, fit, sizes, inverse)
@@ -95,6 +100,34 @@ def uncertain(problem: Problem, fit: Fit, spans: list[tuple[float, float]]) -> l
             says += " (95 %): these recordings do not determine it. "
             says += "Hold it at a known value, or record a motion that depends on it."
             found.append(Finding("excitation", p.name, says))
+    return found
+
+
+def idle_inputs(problem: Problem, fit: Fit) -> list[Finding]:
+    """Inputs that move the outputs by no more than noise: parameters that scale with them are not determined.
+
+    A free decay shows damping and stiffness over mass. With the noise of a force that was not there, a mass is fitted too,
+    whose interval takes that noise for an exact input.
+    """
+    model, found = problem.model, []
+    if not model.driven or not fit.residuals:
+        return []
+    noise_sd = np.array([noise.sigma for noise in problem.noise])
+    for name in model.quiet_inputs:
+        still = []
+        for segment in problem.segments:
+            channels = segment.recording.channels
+            level = np.full(segment.n, float(np.nanmedian(channels[name])))
+            other = model.prepare(replace(segment.recording, channels={**channels, name: level}))
+            other.start, other.begin = segment.start, segment.begin
+            still.append(segment.y - problem.simulate(other, fit.terms, fit.values))
+        gain = compare(problem.segments, "both", still, fit.residuals, noise_sd, problem.rules)
+        if gain.log_likelihood < problem.rules.heldout_log_likelihood:
+            column = problem.columns.get(name, name)
+            says = f"Column {column} moves the output by less than noise: the residual is as small without it. These "
+            says += "recordings determine ratios of the nominal parameters, not those that scale with this column. "
+            says += f"Record a motion that column {column} drives, or hold one of these parameters at a known value."
+            found.append(Finding("excitation", column, says))
     return found
 
 
@@ -167,6 +200,28 @@ def _coloured(problem: Problem, J: Array, base: Array) -> Array:
             if seen.size:
                 total += rate.T @ rate * float(np.mean(seen**2)) * correlation_time(np.where(row != 0.0, row, np.nan))
     return total
+
+
+def _level(base: Array) -> float:
+    """Mean square of weighted residuals (samples,); missing ones are zero."""
+    seen = base[base != 0.0]
+    return float(np.mean(seen**2)) if seen.size else 1.0
+
+
+def _by_bounds(problem: Problem, parameters: list[Parameter], sizes: list[float], base: Array) -> Array:
+    """Precision of what the bounds of each free parameter say of it, in the units of the residuals; zero without bounds.
+
+    Where some parameters can take each other's place, rounding decides how far they may go, and an effect that they hardly
+    touch would go with them.
+    """
+    level = _level(base)
+    reach = [
+        np.log(parameters[k].high / parameters[k].low)
+        if parameters[k].log and parameters[k].low > 0.0
+        else (parameters[k].high - parameters[k].low) / sizes[k]
+        for k in free(parameters)
+    ]
+    return np.array([level * (2.0 / width) ** 2 if np.isfinite(width) and width > 0.0 else 0.0 for width in reach])
 
 
 def _blocks(problem: Problem, J: Array, base: Array) -> list[tuple[Array, Array]]:

@@ -109,6 +109,7 @@ class Model(ABC):
     hold_words: tuple[str, Mapping[str, str]] = ("", HOLD_WORDS)  # of what it says (empty: of its inputs), and what
     either_sign: bool = False  # whether a force that is read may count against the motion as well as with it
     simulates: bool = False  # whether it runs a simulator, whose law cannot be read: data are checked against its outputs
+    driven: bool = False  # whether its inputs move a state of its own, which outputs show
     pointwise: bool = False  # whether outputs answer the signal at a port sample by sample: then `sensitivity` is defined
 
     @abstractmethod

@@ -72,6 +72,7 @@ class AxisModel(Model):
         force, motion, name = self.units[self.spec.input], self.units[self.spec.output], self.spec.subsystem
         place = integral_unit(motion, READ.index(self.spec.reads))
         self.free_run = not self.spec.runs_away or self.spec.compare == "motion"
+        self.driven = self.free_run and self.spec.controller is None
         outputs = [Output(self.spec.output, motion, name)] if self.free_run else []
         if self.spec.controller is not None or not self.free_run:
             outputs.append(Output(self.spec.input, force, name))

@@ -57,6 +57,7 @@ class LinearModel(SimulatedModel):
     """Nominal model of kind `linear`: a transfer function or state space, alone or in a loop."""
 
     kind = "linear"
+    driven = True
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.linear is None:

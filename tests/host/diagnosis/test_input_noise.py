@@ -55,3 +55,30 @@ def test_the_noise_of_the_force_is_that_of_the_smoothed_motion() -> None:
     x, v, a = (smooth_derivatives(noise, DT_S, window, DEGREE)[k] for k, window in enumerate(moved.windows))
     measured = float(np.std(law[0] * x + law[1] * v + law[2] * a))
     assert moved.noise_of_force(law, DT_S) == pytest.approx(measured, rel=0.03)
+
+
+def test_a_free_decay_determines_ratios_only() -> None:
+    """A mass of 19 kg instead of 1.2 kg was stated, with an interval that took the noise of the force for an exact input."""
+    rng, t = np.random.default_rng(303), 0.01 * np.arange(2000)
+    roots = np.roots([1.2, 3.0, 150.0])
+    weights = np.linalg.solve(np.array([[1.0, 1.0], roots]), [0.08, 0.0])
+    x = np.real(np.exp(np.outer(t, roots)) @ weights)
+    axis = {
+        "subsystem": "stage",
+        "input": "f",
+        "output": "x",
+        "terms": ["mass", "damping", "stiffness"],
+        "reads": "position",
+    }
+    nominal = {
+        "name": "stage",
+        "kind": "axis",
+        "data": {"time": "t"},
+        "channels": {"f": {"column": "f", "unit": "N"}, "x": {"column": "x", "unit": "m"}},
+        "axis": axis,
+        "parameters": {"mass": 1.1, "damping": 3.5, "stiffness": 140.0},
+    }
+    table = {"t": t, "f": 0.01 * rng.standard_normal(t.size), "x": x + 1e-4 * rng.standard_normal(t.size)}
+    content = sd.diagnose([table], nominal).as_dict()
+    assert [f["channel"] for f in content["data_findings"] if f["id"] == "excitation"] == ["f"]
+    assert content["next"].startswith("Column f moves the output by less than noise")

@@ -353,3 +353,21 @@ def test_a_continuous_loop_is_the_integrated_one(hold: str) -> None:
     segment.begin.values = np.array([0.2, -0.3 / rate, 4.0 * 0.05])
     assert segment.begin.names == ("y_0", "y_1", "command_0")
     assert np.max(np.abs(model.simulate(segment, np.array([5.0, 0.4]), [])[0] - y)) < 1e-3
+
+
+def test_parameters_that_take_each_others_place_hide_no_drift() -> None:
+    """A gain a b: its flat direction widened the interval of the drift until it contained zero, and nothing was named."""
+    runs = []
+    for seed in (1, 2, 3):
+        rng, t = np.random.default_rng(seed), 0.04 * np.arange(1000)
+        u = np.repeat(rng.uniform(-1.0, 1.0, 40), 25)
+        y = signal.lfilter([1.0 - np.exp(-0.04 / 0.7)], [1.0, -np.exp(-0.04 / 0.7)], np.concatenate(([0.0], u[:-1])))
+        runs.append({"t": t, "u": u, "y": 1.5 * y + 0.002 * t + 0.02 * rng.standard_normal(t.size)})
+    section = {"inputs": ["u"], "outputs": ["y"], "numerator": ["a * b"], "denominator": ["tau", 1.0], "subsystem": "stage"}
+    bounds = {name: {"value": 1.0, "low": 0.1, "high": 10.0} for name in ("a", "b", "tau")}
+    content = sd.diagnose(runs, {**THIRD, "linear": section, "parameters": bounds}).as_dict()
+    (effect,) = content["effects"]
+    assert effect["id"] == "sensor_drift"
+    low, high = effect["parameters"]["rate_m_per_s"]["ci95"]
+    assert 0.001 < low < 0.002 < high < 0.003
+    assert {f["channel"] for f in content["data_findings"] if f["id"] == "excitation"} == {"a", "b"}
