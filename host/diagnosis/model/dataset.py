@@ -22,6 +22,7 @@ from protocol.errors import InputError
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 # Names of columns that hold times, if their values increase: t, time_s, Time (s), stamp, timestamp_ms, ...
+WITHOUT_TIME = ("transmission", "rig")  # kinds whose laws need no rates: their samples may be untimed
 TIME = re.compile(r"(t|time|stamp|timestamp|seconds)(?![a-z0-9])", re.IGNORECASE)
 BLOCKS_OF_A_LONE_RECORDING = 10
 # Of an even grid: points for each row, and points in all, above which its gaps are cut short.
@@ -205,7 +206,7 @@ def _time_line(spec: NominalSpec, table: Table, n: int) -> tuple[Array, bool]:
     if spec.data.rate_Hz is not None:
         return np.arange(n) / spec.data.rate_Hz, True
     channels = {channel.column for channel in spec.channels.values()}
-    for column, values in columns.items():
+    for column, values in columns.items() if spec.kind not in WITHOUT_TIME else ():
         if column not in channels and TIME.match(column) and values.size == n > 1 and bool(np.all(np.diff(values) > 0.0)):
             found = f"nothing, although column {column} of {name} seems to hold times"
             raise InputError("data.time", found, f'the column with seconds or dates, as time = "{column}", or rate_Hz')

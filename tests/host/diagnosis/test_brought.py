@@ -255,7 +255,7 @@ def test_a_closed_loop_is_simulated_without_a_warning(recwarn: pytest.WarningsRe
     assert A.flags.c_contiguous and B.flags.c_contiguous
     controller = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[120.0]]))
     loop = StateSpace(A, B, np.array([[1.0, 0.0]]), np.zeros((1, 1)))
-    y, _ = closed_loop(loop, controller, 0, np.ones(600), np.zeros((2, 600)), np.zeros(2))
+    y, _ = closed_loop(loop, controller, 0, np.ones(600), np.zeros((2, 600)), np.zeros(2), np.zeros(0))
     assert y[0, -1] == pytest.approx(1.0, abs=1e-3)
     assert not [w for w in recwarn if "contiguous" in str(w.message)]
 
