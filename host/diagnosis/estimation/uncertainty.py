@@ -37,12 +37,12 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     by_begin, known = _by_begin(problem, fit, base)
     rates = jacobian(problem, fit.terms, fit.values, base, sizes)
     J = np.column_stack([rates, by_begin])
-    level, bounds = _level(base), _by_bounds(problem, parameters, sizes, base)
+    bounds = _by_bounds(problem, parameters, sizes, base)
     prior = np.diag(np.concatenate((bounds, known)))
     inverse = _inverse(J.T @ J + prior)
     quantile = float(stats.norm.ppf(0.5 + 0.5 * level))
     # What is said by bounds alone varies as they do: a direction that no data show is as wide as they are.
-    scores = _coloured(problem, J, base) + level * np.diag(np.concatenate((bounds, np.zeros(known.size))))
+    scores = _coloured(problem, J, base) + _level(base) * np.diag(np.concatenate((bounds, np.zeros(known.size))))
     even = np.sqrt(np.maximum(np.diag(inverse @ scores @ inverse), 0.0))
     spread, freedom = _jackknife(_blocks(problem, J, base), prior)
     fine = np.maximum(quantile * even, stats.t.ppf(0.5 + 0.5 * level, freedom) * spread)
@@ -119,7 +119,7 @@ def idle_inputs(problem: Problem, fit: Fit) -> list[Finding]:
             channels = segment.recording.channels
             level = np.full(segment.n, float(np.nanmedian(channels[name])))
             other = model.prepare(replace(segment.recording, channels={**channels, name: level}))
-            other.start, other.begin = segment.start, segment.begin
+            other.start, other.begin, other.equations = segment.start, segment.begin, segment.equations
             still.append(segment.y - problem.simulate(other, fit.terms, fit.values))
         gain = compare(problem.segments, "both", still, fit.residuals, noise_sd, problem.rules)
         if gain.log_likelihood < problem.rules.heldout_log_likelihood:
