@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from host.diagnosis.effects.periodic_disturbance import PHASE, oscillation
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, lines
 
 
@@ -25,8 +26,7 @@ def beat(s: Scale, form: str) -> tuple[Parameter, ...]:
 def line(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes along the base axes of a motion on one line, its phase and frequency."""
     frequency = replace(beat(s, form)[-1], spectral=True)
-    phase = Parameter("phase", "rad", (0.0, np.pi / 3.0, 2.0 * np.pi / 3.0), -np.pi, 2.0 * np.pi, step=0.1)
-    return (*(Parameter(f"amplitude_{a}", "m", (2e-5,), linear=True) for a in "xyz"), phase, frequency)
+    return (*(Parameter(f"amplitude_{a}", "m", (2e-5,), linear=True) for a in "xyz"), PHASE, frequency)
 
 
 def rock(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -79,7 +79,7 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
     if form == "drift":
         return {**state, "shift": state["shift"] + p[:, None] * t}
     if form == "line":
-        return {**state, "shift": state["shift"] + np.outer(p[:3], np.sin(2.0 * np.pi * p[4] * t + p[3]))}
+        return {**state, "shift": state["shift"] + oscillation(c, p, form)}
     if form in ("beat", "rock"):
         phase = 2.0 * np.pi * p[-1] * t
         moved = {**state, "shift": state["shift"] + _waves(p[:6], phase)}

@@ -13,6 +13,7 @@ LEAST_PERIODS = 1.0  # in a recording: less of a sine cannot be separated from a
 PERIODS = 2.0 / 3.0  # pitch against the span beyond which a bend is not a period: crest and trough have to come back
 # Pitch of an angle beyond which it is once a turn, which is whip: midway to twice a turn, as of a universal joint.
 LONGEST_ANGLE = float(np.sqrt(2.0) * np.pi)
+PHASE = Parameter("phase", "rad", (0.0, np.pi / 3.0, 2.0 * np.pi / 3.0), -np.pi, 2.0 * np.pi, step=0.1)
 
 
 def frequency(s: Scale, highest_Hz: float) -> Parameter:
@@ -130,12 +131,11 @@ def reading_on_a_line(s: Scale, form: str) -> tuple[Parameter, ...]:
 
     A base that oscillates on a line has as many parameters: neither of the two is preferred for having fewer.
     """
-    phase = Parameter("phase", "rad", (0.0, np.pi / 3.0, 2.0 * np.pi / 3.0), -np.pi, 2.0 * np.pi, step=0.1)
-    return (*(Parameter(f"amplitude_{a}", s.unit, (s.need,), linear=True) for a in "xyz"), phase, frequency(s, 5.0))
+    return (*(Parameter(f"amplitude_{a}", s.unit, (s.need,), linear=True) for a in "xyz"), PHASE, frequency(s, 5.0))
 
 
-def _wave(c: Context, p: Array, form: str) -> Array:
-    """An oscillation of three readings, (3, n)."""
+def oscillation(c: Context, p: Array, form: str) -> Array:
+    """Three sums of sine and cosine (3, n), amplitudes in pairs; form `line`: three amplitudes of one sine with a phase."""
     phase = 2.0 * np.pi * p[-1] * c.time_s
     if form == "line":
         return np.outer(p[:3], np.sin(phase + p[3]))
@@ -144,13 +144,13 @@ def _wave(c: Context, p: Array, form: str) -> Array:
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
     """Add an oscillation that no motion causes to both positions; orientations and forces are unchanged."""
-    wave = _wave(c, p, form)
+    wave = oscillation(c, p, form)
     return {**run, "tip": run["tip"] + wave, "shaft": run["shaft"] + wave}
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
     """The force reads with a line."""
-    return np.asarray(signal + _wave(c, p, form))
+    return np.asarray(signal + oscillation(c, p, form))
 
 
 EFFECTS = (

@@ -79,7 +79,6 @@ class LinearModel(SimulatedModel):
             raise InputError("linear.hold", self.hold, f"one of {', '.join(holds)} without linear.feedback")
         if self.spec.feedback is not None:
             self.hold_words = ("The controller", LOOP_WORDS)
-        if self.spec.feedback is not None:
             output, channels = self.spec.feedback.output, tuple(self.spec.outputs)
             self.inside_units = {actuation: self.units.get(self.spec.feedback.actuation, ""), fed_back: self.units[output]}
             self.ports += (

@@ -1,7 +1,7 @@
 """Inputs that were not recorded for a while: one value is repeated, and the output moves on as if it were driven.
 
 An input may be meant to rest, and readings without noise may repeat a value while a mechanism sticks. Both follow the
-nominal model about as well as the rest of the recording does. A frozen channel does not: past its samples the model
+nominal model about as well as the other samples do. A frozen channel does not: past its samples the model
 fits, and over them it leaves a large part of the motion.
 """
 

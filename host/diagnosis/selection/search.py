@@ -351,7 +351,7 @@ def _drop_unsure_events(problem: Problem, found: Found, candidate_effects: list[
                 smallest = min(sizes, key=lambda k: abs(fit.values[first + k]))
                 values = np.delete(fit.values, [first + smallest, first + smallest + 1])
                 terms = tuple(fewer if other is term else other for other in fit.terms)
-                found.steps.append(Step(SearchMove.UNSURE, term.candidate.key, Gain(0.0, 1.0, 0.0)))
+                found.steps.append(Step(SearchMove.UNSURE, term.candidate.key))
                 found.best = refined(problem, minimize(problem, terms, values))
                 break
         else:
