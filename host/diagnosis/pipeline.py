@@ -16,7 +16,7 @@ from host.diagnosis.design.experiment import Design, design
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation import noise as noise_module
 from host.diagnosis.estimation.coloured import independent_samples
-from host.diagnosis.estimation.evidence import compare, whiteness
+from host.diagnosis.estimation.evidence import whiteness
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.known import Known
@@ -256,18 +256,17 @@ def _diagnosed(
     done = done or _searched(spec, data, left_out, rules, budget, overall, (0.3 if axis is not None else 0.02, 0.7))
     assert done is not None
     model, problem, full, found = done.model, done.problem, done.full, done.found
-    noise_sd = np.array([n.sigma for n in problem.noise])
     overall.part(0.7, 0.75)("comparing rivals in the place of each effect", 0.0)
-    standing = most_probable(problem, found, noise_sd)
+    standing = most_probable(problem, found)
     named_before = found.best
-    remainder = explain_remainder(problem, found, noise_sd, overall.part(0.75, 0.85))
+    remainder = explain_remainder(problem, found, overall.part(0.75, 0.85))
     if found.best is not named_before:  # an equation took the place of effects
-        standing = standings(problem, found, noise_sd)
-    while fewer := without_improbable(problem, found, standing, remainder, noise_sd):
+        standing = standings(problem, found)
+    while fewer := without_improbable(problem, found, standing, remainder):
         standing, remainder = fewer
     probable = max((probability_of(one, remainder.share, problem.rules).effect for one in standing), default=0.0)
     unlike = probable < problem.rules.further_probability and not budget.spent()
-    between = unlike_recordings(problem, found.nominal, noise_sd) if unlike else []
+    between = unlike_recordings(problem, found.nominal) if unlike else []
     if between and found.best.terms:
         found.best, standing = fit_nominal(problem), []
     standing = with_unlisted_rival(standing, remainder)
@@ -304,7 +303,7 @@ def _diagnosed(
     if not found.best.terms:
         result.findings += _lines(full, fits)
     if result.verdict == "nothing_missing":
-        slow = slow_outputs(problem, found.best, noise_sd)
+        slow = slow_outputs(problem, found.best)
         late = any(finding.id == "within_sample" for finding in done.findings)  # it explains what exceeds the noise
         result.findings += _too_slow(full, fits, slow) or ([] if late else _above_guess(full, figures, problem.rules))
     if not located and remainder.sure and remainder.predicted is not None:
@@ -457,10 +456,9 @@ def _past_delay(
     delay_s = found.best.values[len(problem.model.parameters) : len(model.parameters)]
     if not own or float(np.sum(np.abs(delay_s))) > problem.rules.sampling_delay * problem.segments[0].recording.dt_s:
         return None
-    noise_sd = np.array([n.sigma for n in problem.noise])
     before, rules = late.fit.residuals, problem.rules
-    ahead = compare(problem.segments, "both", before, found.best.residuals, noise_sd, problem.rules).log_likelihood
-    earned = compare(problem.segments, "both", begun.found.nominal.residuals, before, noise_sd, problem.rules).log_likelihood
+    ahead = problem.gain("both", before, found.best.residuals).log_likelihood
+    earned = problem.gain("both", begun.found.nominal.residuals, before).log_likelihood
     if ahead < -max(rules.heldout_log_likelihood, rules.refinement_tolerance * earned):
         return None
     return _Searched(model, again, full, found, [*begun.findings, *late_by_a_sample(again, late, past=True)])
@@ -670,7 +668,7 @@ def _figures(full: Problem, fits: FullRate) -> Figures:
     primary = int(np.argmax(np.where(used, ratio, 0.0)))
     # The residual is noise and perhaps more: an estimate above it, of parts taken for rest, is too high.
     left = np.array([rms([r[row] for r in best.residuals]) for row in rows])
-    noise_sd = np.fmin([noise.sigma for noise in full.noise], np.where(left > 0.0, left, np.nan))
+    noise_sd = np.fmin(full.noise_sd, np.where(left > 0.0, left, np.nan))
     return Figures(before, after, noise_sd, white_b, white_a, primary)
 
 

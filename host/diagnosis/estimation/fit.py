@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import correlation_time
+from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, cornered
@@ -89,6 +89,18 @@ class Problem:
     def apart(self) -> bool:
         """Return whether whole recordings are held out, not blocks between the fitted ones."""
         return any(segment.heldout.any() and not segment.fit.any() for segment in self.segments)
+
+    @property
+    def noise_sd(self) -> Array:
+        """Return the standard deviation of each output's noise (outputs,), in its own unit."""
+        return np.array([noise.sigma for noise in self.noise])
+
+    def gain(self, which: str, before: list[Array], after: list[Array], segments: list[Segment] | None = None) -> Gain:
+        """Gain of the residuals `after` over `before` on samples `which` (`fit`, `heldout`, `both`), see `compare`.
+
+        segments: those that the residuals belong to, where they are not all of the problem's own.
+        """
+        return compare(self.segments if segments is None else segments, which, before, after, self.noise_sd, self.rules)
 
     def parameters(self, terms: tuple[Term, ...]) -> list[Parameter]:
         """All parameters of a structure, nominal first."""

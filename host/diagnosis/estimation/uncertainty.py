@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from host.diagnosis.estimation.evidence import compare, correlation_time
+from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, answers_to_begin, free, jacobian, size_of
 from host.diagnosis.model.effect import Parameter
 from host.diagnosis.model.findings import Finding
@@ -112,7 +112,6 @@ def idle_inputs(problem: Problem, fit: Fit) -> list[Finding]:
     model, found = problem.model, []
     if not model.driven or not fit.residuals:
         return []
-    noise_sd = np.array([noise.sigma for noise in problem.noise])
     for name in model.quiet_inputs:
         still = []
         for segment in problem.segments:
@@ -121,7 +120,7 @@ def idle_inputs(problem: Problem, fit: Fit) -> list[Finding]:
             other = model.prepare(replace(segment.recording, channels={**channels, name: level}))
             other.start, other.begin, other.equations = segment.start, segment.begin, segment.equations
             still.append(segment.y - problem.simulate(other, fit.terms, fit.values))
-        gain = compare(problem.segments, "both", still, fit.residuals, noise_sd, problem.rules)
+        gain = problem.gain("both", still, fit.residuals)
         if gain.log_likelihood < problem.rules.heldout_log_likelihood:
             column = problem.columns.get(name, name)
             says = f"Column {column} moves the output by less than noise: the residual is as small without it. These "

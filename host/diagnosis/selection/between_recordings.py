@@ -25,7 +25,7 @@ class Apart:
     left: float  # with their own
 
 
-def unlike_recordings(problem: Problem, nominal: Fit, noise_sd: Array) -> list[Finding]:
+def unlike_recordings(problem: Problem, nominal: Fit) -> list[Finding]:
     """A finding (id `session`) where each recording alone is explained by the nominal model, with parameters of its own,
     and all together are not. Nothing where a recording cannot tell the parameters that it is given.
 
@@ -36,7 +36,7 @@ def unlike_recordings(problem: Problem, nominal: Fit, noise_sd: Array) -> list[F
         return []
     if min(segment.n for segment in problem.segments) < problem.rules.session_samples_per_parameter * len(moving):
         return []
-    apart = _apart(problem, nominal, noise_sd)
+    apart = _apart(problem, nominal)
     if apart is None:
         return []
     said = []
@@ -59,9 +59,10 @@ def unlike_recordings(problem: Problem, nominal: Fit, noise_sd: Array) -> list[F
     return [Finding("session", problem.columns.get(output.channel, output.channel), says)]
 
 
-def _apart(problem: Problem, nominal: Fit, noise_sd: Array) -> Apart | None:
+def _apart(problem: Problem, nominal: Fit) -> Apart | None:
     """Each recording fitted alone; None where the nominal model explains all together, or not each alone."""
     before = _levels(problem, nominal.residuals)
+    noise_sd = problem.noise_sd
     excess = before**2 - noise_sd**2
     row = int(np.argmax(excess / np.maximum(noise_sd, 1e-300) ** 2))
     if before[row] < problem.rules.residual_over_noise * noise_sd[row]:

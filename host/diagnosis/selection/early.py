@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
-from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, jacobian, minimize, size_of
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate
@@ -96,21 +95,20 @@ def _lead(problem: Problem, nominal: Fit, row: int, candidates: Sequence[Candida
     late = (_shifted(problem, row, -lag).power for lag in lags)
     if first.power > most or any(first.power > data.clock_residual_ratio * power for power in late):
         return None
-    noise_sd = np.array([noise.sigma for noise in problem.noise])
     plain = [replace(segment, fed_back=[]) for segment in problem.segments]
-    gain = compare(plain, "both", nominal.residuals, first.fit.residuals, noise_sd, rules)
+    gain = problem.gain("both", nominal.residuals, first.fit.residuals, plain)
     if gain.log_likelihood < rules.pooled_log_likelihood or gain.p_value > rules.significance:
         return None
     own = max(_dead_samples(problem, values, row) for values in (nominal.values, first.fit.values))
     if first.samples - own < data.clock_lead_samples:
         return None
-    best = _with_fraction(problem, row, first, noise_sd)
+    best = _with_fraction(problem, row, first)
     if not _clean(problem, row, best):
         _hold(problem.model, problem.segments, stated)
         base = fit_nominal(problem)
         ranked = worth_fitting(problem, base, screen(problem, base, list(candidates), lambda *_: None))
-        for trial in (try_fit(problem, base, item, noise_sd) for item in ranked):
-            ahead = compare(plain, "both", best.fit.residuals, trial.fit.residuals, noise_sd, rules).log_likelihood
+        for trial in (try_fit(problem, base, item) for item in ranked):
+            ahead = problem.gain("both", best.fit.residuals, trial.fit.residuals, plain).log_likelihood
             if ahead > rules.equal_log_likelihood:
                 return None
     return best.samples
@@ -207,7 +205,7 @@ def _nearest(problem: Problem, row: int, fits: list[_Shifted]) -> _Shifted:
     return best
 
 
-def _with_fraction(problem: Problem, row: int, best: _Shifted, noise_sd: Array) -> _Shifted:
+def _with_fraction(problem: Problem, row: int, best: _Shifted) -> _Shifted:
     """`best`, or a lead by a part of a sample, or one of whole samples with another hold of the input, if that is better.
 
     A held input is half a sample late, so smooth recordings may not separate a hold from half a sample of lead. Other holds
@@ -218,7 +216,7 @@ def _with_fraction(problem: Problem, row: int, best: _Shifted, noise_sd: Array) 
 
     def better(one: _Shifted, other: _Shifted) -> bool:
         """Whether `one` is better by as much as an effect has to be."""
-        gain = compare(plain, "both", other.fit.residuals, one.fit.residuals, noise_sd, rules)
+        gain = problem.gain("both", other.fit.residuals, one.fit.residuals, plain)
         return gain.log_likelihood > rules.pooled_log_likelihood and gain.p_value < rules.significance
 
     around = [best.samples - 1.0, best.samples, best.samples + 1.0]

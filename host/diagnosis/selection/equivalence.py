@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
+from host.diagnosis.estimation.evidence import Gain, correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
 from host.diagnosis.estimation.initial_state import begun_again
 from host.diagnosis.estimation.rules import SelectionRules
@@ -38,33 +38,33 @@ class Standing:
     crossed: bool = False  # `gain` is that of recordings that are predicted from one another
 
 
-def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]:
+def standings(problem: Problem, found: Found) -> list[Standing]:
     """For every effect of the best structure: its gain over the structure without it, and its equals."""
     out = []
     for term in found.best.terms:
         begun = get_starts(problem)
         less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal, begin_again=True)
         set_starts(problem, begun)
-        gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd, problem.rules)
-        both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd, problem.rules)
-        crossed = unexcited(problem, less, found.best, term.fitted, noise_sd, gain)
+        gain = problem.gain("heldout", less.residuals, found.best.residuals)
+        both = problem.gain("both", less.residuals, found.best.residuals)
+        crossed = unexcited(problem, less, found.best, term.fitted, gain)
         gain = crossed or gain
-        alike, rivals = _equals(problem, found, term.candidate, less, both, noise_sd)
-        said = _better_said(problem, found, term.candidate, less, both, noise_sd)
+        alike, rivals = _equals(problem, found, term.candidate, less, both)
+        said = _better_said(problem, found, term.candidate, less, both)
         alike += tuple(candidate for candidate, _ in said if candidate.name != term.candidate.name)
-        paired = _pairs(problem, found, term.candidate, both, noise_sd)
+        paired = _pairs(problem, found, term.candidate, both)
         alike += tuple(dict.fromkeys(part for part, _ in paired if part not in alike))
         least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said, *paired))
-        alone = _rests_on(problem, less, found.best, noise_sd, term.fitted)
+        alone = _rests_on(problem, less, found.best, term.fitted)
         # No inexact formula of another effect leaves a line that no motion has.
         doubtful = less.terms and not term.candidate.effect.memories
-        share = _share(found, less, noise_sd) if doubtful else np.inf
+        share = _share(problem, found, less) if doubtful else np.inf
         out.append(Standing(term.candidate, gain, both, alike, differences, term.fitted, share, alone, crossed is not None))
     return out
 
 
-def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]:
+def most_probable(problem: Problem, found: Found) -> list[Standing]:
     """Standings of a structure in which no listed rival is plainly likelier than the effect that it could replace.
 
     An effect enters by what it gains on held-out samples. Among effects of one step these gains can be alike while all
@@ -73,7 +73,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
     where it is likelier at all: a gain of more parameters below their cost is chance. Changes `found.best`.
     """
     seen = [found.best.names]
-    standing = standings(problem, found, noise_sd)
+    standing = standings(problem, found)
     for _ in range(problem.rules.exchange_rounds):
         behind = [
             (difference, k, rival)
@@ -89,7 +89,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
         step = next(s for s in found.steps if any(t.candidate.key == rival.key for t in s.trials))
         trial = next(t for t in step.trials if t.candidate.key == rival.key)
         other = _with_rival(problem, found.best, standing[k].candidate, trial)
-        ahead = compare(problem.segments, "both", before.residuals, other.residuals, noise_sd, problem.rules)
+        ahead = problem.gain("both", before.residuals, other.residuals)
         likelier = coarse(ahead, other.fitted - before.fitted, standing[k].both, problem.rules) > 0.0
         if other.names in seen or not likelier or at_bound(other):
             set_starts(problem, begun)
@@ -97,7 +97,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
         found.best = other
         found.steps.append(Step(SearchMove.SWAP, rival.key, ahead, step.trials))
         seen.append(other.names)
-        standing = standings(problem, found, noise_sd)
+        standing = standings(problem, found)
     return standing
 
 
@@ -107,9 +107,7 @@ def _simpler(found: Found, rival: Candidate, standing: Standing) -> bool:
     return any(trial.fit.terms[-1].fitted < standing.parameters for trial in tried)
 
 
-def _pairs(
-    problem: Problem, found: Found, candidate: Candidate, earned: Gain, noise_sd: Array
-) -> list[tuple[Candidate, float]]:
+def _pairs(problem: Problem, found: Found, candidate: Candidate, earned: Gain) -> list[tuple[Candidate, float]]:
     """Effects of pairs that do as well as `candidate`, the only effect that is named: each with its coarsened difference.
 
     A pair is one explanation: its two effects share its weight.
@@ -120,7 +118,7 @@ def _pairs(
     for pair in found.pairs:
         if candidate in [term.candidate for term in pair.terms]:
             return []  # another effect was named when they were compared
-        ahead = compare(problem.segments, "both", pair.residuals, found.best.residuals, noise_sd, problem.rules)
+        ahead = problem.gain("both", pair.residuals, found.best.residuals)
         if ahead.log_likelihood < problem.rules.equal_log_likelihood:
             difference = coarse(ahead, found.best.fitted - pair.fitted, earned, problem.rules) + float(
                 np.log(len(pair.terms))
@@ -135,7 +133,7 @@ def _own(standing: Standing) -> float:
 
 
 def without_improbable(
-    problem: Problem, found: Found, standing: list[Standing], remainder: Remainder, noise_sd: Array
+    problem: Problem, found: Found, standing: list[Standing], remainder: Remainder
 ) -> tuple[list[Standing], Remainder] | None:
     """Standings and remainder without the least probable effect, where another one is probable and it is not.
 
@@ -157,8 +155,8 @@ def without_improbable(
     weakest = standing[min(doubtful)[1]]
     begun, before = get_starts(problem), found.best
     found.best = fit_without(problem, before, (weakest.candidate.key,), rounds=10, begin_again=True)
-    fewer = standings(problem, found, noise_sd)
-    left = remainder_of(problem, found, noise_sd)
+    fewer = standings(problem, found)
+    left = remainder_of(problem, found)
     if max(probability_of(one, left.share, problem.rules).raw for one in fewer) < least or unsure(problem, found.best):
         found.best = before
         set_starts(problem, begun)
@@ -181,12 +179,12 @@ def _with_rival(problem: Problem, best: Fit, candidate: Candidate, trial: Trial)
     return refined(problem, finish(problem, minimize(problem, (*terms, term), begin, rounds=10, tolerance=1e-4)))
 
 
-def _share(found: Found, less: Fit, noise_sd: Array) -> float:
+def _share(problem: Problem, found: Found, less: Fit) -> float:
     """Part of the nominal mismatch above noise that an effect removes from the model `less` without it, in the output where
     that is most.
     """
     largest = 0.0
-    for row, sigma in enumerate(noise_sd):
+    for row, sigma in enumerate(problem.noise_sd):
         nominal, without_it, best = (
             float(np.nanmean(np.concatenate([r[row] for r in fit.residuals]) ** 2))
             for fit in (found.nominal, less, found.best)
@@ -196,7 +194,7 @@ def _share(found: Found, less: Fit, noise_sd: Array) -> float:
     return largest
 
 
-def _rests_on(problem: Problem, less: Fit, best: Fit, noise_sd: Array, parameters: int) -> str:
+def _rests_on(problem: Problem, less: Fit, best: Fit, parameters: int) -> str:
     """The recording that the evidence rests on: without it, the gain of all others would let no effect enter.
 
     The fits are those of all recordings; the evidence is summed without one at a time.
@@ -207,7 +205,7 @@ def _rests_on(problem: Problem, less: Fit, best: Fit, noise_sd: Array, parameter
         keep = [k for k in range(len(problem.segments)) if k != left_out]
         segments = [problem.segments[k] for k in keep]
         before, after = [less.residuals[k] for k in keep], [best.residuals[k] for k in keep]
-        gain = compare(segments, "both", before, after, noise_sd, problem.rules).log_likelihood if keep else 0.0
+        gain = problem.gain("both", before, after, segments).log_likelihood if keep else 0.0
         gains.append((gain, segment.recording.name))
     gain, name = min(gains)
     return name if gain < needed else ""
@@ -229,15 +227,15 @@ def with_unlisted_rival(standing: list[Standing], remainder: Remainder) -> list[
 
 
 def _better_said(
-    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, noise_sd: Array
+    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain
 ) -> tuple[tuple[Candidate, float], ...]:
     """An equation that does plainly better in the place of `candidate`: if it says something else, `candidate` may be the
     wrong name; if it says the same, the form of `candidate` is not exact, and no rival's form has to be the better name.
     """
     if candidate.effect.searched:
         return ()
-    for trial in equations_for(problem, less, candidate.port, noise_sd):
-        behind = compare(problem.segments, "both", found.best.residuals, trial.fit.residuals, noise_sd, problem.rules)
+    for trial in equations_for(problem, less, candidate.port):
+        behind = problem.gain("both", found.best.residuals, trial.fit.residuals)
         if behind.log_likelihood > problem.rules.equal_log_likelihood:
             # its form was chosen among hundreds: it is not simpler than an effect with more parameters
             more = max(trial.fit.fitted - found.best.fitted, 0)
@@ -246,7 +244,7 @@ def _better_said(
 
 
 def _equals(
-    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, noise_sd: Array
+    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain
 ) -> tuple[tuple[Candidate, ...], list[tuple[Candidate, float]]]:
     """Rivals in the place of `candidate`: those that neither held-out samples nor all together separate from it, and all
     that were refitted with their coarsened differences.
@@ -275,9 +273,9 @@ def _equals(
             continue
         if at_bound(other) and other.fitted > best.fitted:
             continue  # its further parameter ended at a bound, so it says what the simpler one says
-        ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd, problem.rules)
-        held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd, problem.rules)
-        rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd, problem.rules)
+        ahead = problem.gain("both", other.residuals, best.residuals)
+        held = problem.gain("heldout", other.residuals, best.residuals)
+        rival = problem.gain("both", less.residuals, other.residuals)
         more = max(earned, rival, key=lambda gain: gain.log_likelihood)
         refitted.append((trial.candidate, ahead_of_rival(ahead, best.fitted - other.fitted, more, problem.rules)))
         if trial.candidate.name == candidate.name:

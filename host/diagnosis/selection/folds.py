@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
 from host.diagnosis.estimation.initial_state import begun_again, start_again
 from host.diagnosis.model.model import Segment
@@ -16,7 +16,7 @@ from host.diagnosis.selection.trial import Trial, at_bound, called_for, of_sampl
 Array = npt.NDArray[np.float64]
 
 
-def with_other_recordings(problem: Problem, base: Fit, trials: list[Trial], noise_sd: Array) -> None:
+def with_other_recordings(problem: Problem, base: Fit, trials: list[Trial]) -> None:
     """Give each trial that only the recordings to fit call for its gain by cross-validation (`Trial.crossed`)."""
     begun = get_starts(problem)
     possible = [
@@ -28,11 +28,11 @@ def with_other_recordings(problem: Problem, base: Fit, trials: list[Trial], nois
     ]
     for trial in possible[: problem.rules.crossed_fits]:
         more = max(trial.fit.fitted - base.fitted, 0)
-        trial.crossed = _where_called_for(problem, base, trial.fit, more, noise_sd, trial.starts)
+        trial.crossed = _where_called_for(problem, base, trial.fit, more, trial.starts)
     set_starts(problem, begun)
 
 
-def unexcited(problem: Problem, base: Fit, fit: Fit, more: int, noise_sd: Array, heldout: Gain | None = None) -> Gain | None:
+def unexcited(problem: Problem, base: Fit, fit: Fit, more: int, heldout: Gain | None = None) -> Gain | None:
     """Gain of `fit` by cross-validation, if the recordings held out say little of it; None where that is not called for.
 
     more: number of its further parameters. heldout: its gain there; None: it is known to say nothing.
@@ -42,21 +42,19 @@ def unexcited(problem: Problem, base: Fit, fit: Fit, more: int, noise_sd: Array,
         return None
     if heldout is not None and refuted(heldout, rules):
         return None
-    return _where_called_for(problem, base, fit, more, noise_sd, get_starts(problem))
+    return _where_called_for(problem, base, fit, more, get_starts(problem))
 
 
-def _where_called_for(
-    problem: Problem, base: Fit, fit: Fit, more: int, noise_sd: Array, starts: list[dict[str, float]]
-) -> Gain | None:
+def _where_called_for(problem: Problem, base: Fit, fit: Fit, more: int, starts: list[dict[str, float]]) -> Gain | None:
     rules = problem.rules
-    trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd, problem.rules)
+    trained = problem.gain("fit", base.residuals, fit.residuals)
     least = rules.pooled_log_likelihood + rules.parameter_penalty * more
     if not problem.apart or trained.log_likelihood < least or problem.budget.spent():
         return None
-    return _crossed(problem, base, fit, noise_sd, starts)
+    return _crossed(problem, base, fit, starts)
 
 
-def _crossed(problem: Problem, base: Fit, fit: Fit, noise_sd: Array, starts: list[dict[str, float]]) -> Gain:
+def _crossed(problem: Problem, base: Fit, fit: Fit, starts: list[dict[str, float]]) -> Gain:
     """Gain of `fit` over `base` on all samples, where each recording is predicted by a fit of the others.
 
     The recordings held out keep the residuals that they have. starts: of the memories in `fit`, for every recording.
@@ -75,7 +73,7 @@ def _crossed(problem: Problem, base: Fit, fit: Fit, noise_sd: Array, starts: lis
             for k in fold:
                 residuals[k] = again.residuals[k]
     set_starts(problem, begun)
-    return compare(problem.segments, "both", before, after, noise_sd, problem.rules)
+    return problem.gain("both", before, after)
 
 
 def _exchanged(segment: Segment, out: bool, used: bool) -> Segment:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, get_starts, minimize, set_starts
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.screening import above_noise
@@ -31,9 +31,7 @@ class PairFit:
     starts: list[dict[str, float]]
 
 
-def best_pair(
-    problem: Problem, nominal: Fit, trials: list[Trial], fit_next: FitNext, noise_sd: Array, progress: Progress
-) -> PairFit | None:
+def best_pair(problem: Problem, nominal: Fit, trials: list[Trial], fit_next: FitNext, progress: Progress) -> PairFit | None:
     """The likeliest pair of refused effects of which each earns its place together with the other; None if there is none.
 
     The effects of a pair are among those fitted alone; or the second is one that shows only past the first.
@@ -54,8 +52,8 @@ def best_pair(
         starts = [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)]
         set_starts(problem, starts)
         fit = _fitted(problem, nominal, a, b)
-        passed = _passed(problem, nominal, fit, starts, noise_sd)
-        if passed is not None and all(_earned_over(problem, fit, alone.fit, noise_sd) for alone in (a, b)):
+        passed = _passed(problem, nominal, fit, starts)
+        if passed is not None and all(_earned_over(problem, fit, alone.fit) for alone in (a, b)):
             found.append(passed)
     for trial in _unlike(singles)[: rules.joint_first]:
         if problem.budget.spent():
@@ -69,16 +67,16 @@ def best_pair(
             seconds += [t for t in fit_next(other, top.starts) if len(t.fit.terms) == 2]
         for second in seconds:
             set_starts(problem, second.starts)
-            fit, passed = second.fit, _passed(problem, nominal, second.fit, second.starts, noise_sd)
+            fit, passed = second.fit, _passed(problem, nominal, second.fit, second.starts)
             if passed is not None and all(
-                _earned_over(problem, fit, _alone(problem, nominal, fit, which), noise_sd) for which in (0, 1)
+                _earned_over(problem, fit, _alone(problem, nominal, fit, which)) for which in (0, 1)
             ):
                 found.append(passed)
     return max(found, key=lambda pair: pair.score, default=None)
 
 
 def pair_instead(
-    problem: Problem, nominal: Fit, one: Fit, trials: list[Trial], noise_sd: Array, restart: Restart
+    problem: Problem, nominal: Fit, one: Fit, trials: list[Trial], restart: Restart
 ) -> tuple[PairFit | None, list[Fit]]:
     """Two effects in the place of the one in `one`, whose formula joins effects of unlike kinds; None if they do no better.
     Then the pairs that do as well: no data tell them from it.
@@ -103,13 +101,13 @@ def pair_instead(
     begun, found, equal = get_starts(problem), [], []
     for a, b in tried[: rules.split_fits]:
         fit = _fitted_anew(problem, nominal, a, b, restart)
-        passed = _passed(problem, nominal, fit, get_starts(problem), noise_sd)
-        ahead = compare(problem.segments, "both", one.residuals, fit.residuals, noise_sd, problem.rules)
+        passed = _passed(problem, nominal, fit, get_starts(problem))
+        ahead = problem.gain("both", one.residuals, fit.residuals)
         more = fit.fitted - one.fitted
         lead = ahead.log_likelihood - rules.parameter_penalty * max(more, 0)
         if lead < -rules.equal_log_likelihood or passed is None:
             continue
-        if all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
+        if all(_earned_over(problem, fit, t.fit) for t in (a, b)):
             equal.append(fit)
             if lead > rules.heldout_log_likelihood:
                 found.append(passed)
@@ -118,9 +116,7 @@ def pair_instead(
     return best, equal if best is None else []
 
 
-def pair_first(
-    problem: Problem, nominal: Fit, trials: list[Trial], noise_sd: Array, restart: Restart, progress: Progress
-) -> PairFit | None:
+def pair_first(problem: Problem, nominal: Fit, trials: list[Trial], restart: Restart, progress: Progress) -> PairFit | None:
     """The likeliest pair of unlike effects that were tried in the first step, one of them at a place along a loaded link;
     None if no pair passes.
 
@@ -142,8 +138,8 @@ def pair_first(
             break
         progress(f"fitting {a.candidate.key} and {b.candidate.key}", count / len(tried))
         fit = _fitted_anew(problem, nominal, a, b, restart)
-        passed = _passed(problem, nominal, fit, get_starts(problem), noise_sd)
-        if passed is not None and all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
+        passed = _passed(problem, nominal, fit, get_starts(problem))
+        if passed is not None and all(_earned_over(problem, fit, t.fit) for t in (a, b)):
             found.append(passed)
     set_starts(problem, begun)
     return max(found, key=lambda pair: pair.score, default=None)
@@ -193,16 +189,16 @@ def _fitted_anew(problem: Problem, nominal: Fit, a: Trial, b: Trial, restart: Re
     return fit
 
 
-def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> bool:
+def _earned_over(problem: Problem, fit: Fit, alone: Fit) -> bool:
     """Whether the pair gains enough over one of its effects `alone`, on samples to fit and on held-out ones, and none of
     the two is at a bound.
     """
     if any(bound_by(fit, term) for term in fit.terms):
         return False
     more = fit.fitted - alone.fitted
-    held = compare(problem.segments, "heldout", alone.residuals, fit.residuals, noise_sd, problem.rules)
-    trained = compare(problem.segments, "fit", alone.residuals, fit.residuals, noise_sd, problem.rules)
-    both = compare(problem.segments, "both", alone.residuals, fit.residuals, noise_sd, problem.rules)
+    held = problem.gain("heldout", alone.residuals, fit.residuals)
+    trained = problem.gain("fit", alone.residuals, fit.residuals)
+    both = problem.gain("both", alone.residuals, fit.residuals)
     rules = problem.rules
     shown = (
         held.log_likelihood >= rules.heldout_log_likelihood + rules.heldout_parameter_cost * more
@@ -217,11 +213,11 @@ def _pooled(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
     return problem.apart and sure_together(problem.rules, held, both, more)
 
 
-def _passed(problem: Problem, nominal: Fit, fit: Fit, starts: list[dict[str, float]], noise_sd: Array) -> PairFit | None:
+def _passed(problem: Problem, nominal: Fit, fit: Fit, starts: list[dict[str, float]]) -> PairFit | None:
     """The pair that was fitted with `starts`; None if it does not pass what a single effect has to."""
     rules, more = problem.rules, fit.fitted - nominal.fitted
-    held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd, problem.rules)
-    both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd, problem.rules)
+    held = problem.gain("heldout", nominal.residuals, fit.residuals)
+    both = problem.gain("both", nominal.residuals, fit.residuals)
     least = max(rules.least_error_reduction, rules.least_excess_reduction * held.excess)
     sure = held.p_value < rules.significance or both.log_likelihood > rules.decisive_log_likelihood
     shown = sure and held.log_likelihood > rules.heldout_log_likelihood + rules.heldout_parameter_cost * more

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
-from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.readings import Finding
@@ -56,11 +53,8 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates
 
 def _better(problem: Problem, base: Fit, fits: Mapping[str, Fit]) -> str | None:
     """The hold of the best of `fits`, if that is better than `base` by as much as an effect has to be; else None."""
-    rules, noise_sd = problem.rules, np.array([noise.sigma for noise in problem.noise])
-    gains = {
-        hold: compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd, problem.rules)
-        for hold, fit in fits.items()
-    }
+    rules = problem.rules
+    gains = {hold: problem.gain("both", base.residuals, fit.residuals) for hold, fit in fits.items()}
     best = max(gains, key=lambda hold: gains[hold].log_likelihood)
     sure = gains[best].log_likelihood > rules.pooled_log_likelihood and gains[best].p_value < rules.significance
     return best if sure else None
@@ -70,10 +64,10 @@ def _late(problem: Problem, hold: str, candidates: Sequence[Candidate]) -> Fit:
     """The nominal model with a free delay of the input that `hold` is about."""
     model = problem.model
     model.hold_as(problem.segments, hold)
-    nominal, noise_sd = fit_nominal(problem), np.array([noise.sigma for noise in problem.noise])
+    nominal = fit_nominal(problem)
     own = model.quiet_inputs
     delays = [c for c in candidates if (c.port.held or c.port.name in own) and c.effect.shifts == "time"]
-    fits = [try_fit(problem, nominal, item, noise_sd).fit for item in screen(problem, nominal, delays, lambda *_: None)]
+    fits = [try_fit(problem, nominal, item).fit for item in screen(problem, nominal, delays, lambda *_: None)]
     return min([nominal, *fits], key=lambda fit: fit.cost)
 
 

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.feedback import find_feedback
 from host.diagnosis.estimation.fit import (
     Fit,
@@ -180,7 +180,7 @@ def _at_noise(problem: Problem, fit: Fit) -> bool:
     return bool(ratios) and float(np.mean(ratios)) < problem.rules.residual_over_noise_nominal**2
 
 
-def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Trial:
+def try_fit(problem: Problem, base: Fit, item: Screened) -> Trial:
     """Full joint refit of one candidate from its best starts."""
     terms, values = without(base, problem, item.drop)
     few = enough(problem)
@@ -203,9 +203,9 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
     fit = placed(problem, _restart(problem, fit, fit.terms[-1].candidate))
     after = get_starts(problem)
     set_starts(problem, begun)
-    heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd, problem.rules)
-    trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd, problem.rules)
-    both = compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd, problem.rules)
+    heldout = problem.gain("heldout", base.residuals, fit.residuals)
+    trained = problem.gain("fit", base.residuals, fit.residuals)
+    both = problem.gain("both", base.residuals, fit.residuals)
     return Trial(
         fit.terms[-1].candidate,
         fit,
@@ -306,20 +306,18 @@ def forward(problem: Problem, candidate_effects: list[Candidate], progress: Prog
     """Nominal refit, then single effects until none is earned: the first part of `search`."""
     progress("refitting the nominal model", 0.0)
     nominal = fit_nominal(problem)
-    noise_sd = np.array([noise.sigma for noise in problem.noise])
     found = Found(nominal, nominal, [])
-    _grow(problem, found, candidate_effects, noise_sd, earned, progress)
+    _grow(problem, found, candidate_effects, earned, progress)
     return found
 
 
 def concluded(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> Found:
     """Pairs, detours, exchanges and removals after `forward`: the second part of `search`."""
-    noise_sd = np.array([noise.sigma for noise in problem.noise])
-    _join(problem, found, candidate_effects, noise_sd, progress)
-    found = _detour(problem, found, candidate_effects, noise_sd, progress)
-    _exchange(problem, found, candidate_effects, noise_sd, progress)
+    _join(problem, found, candidate_effects, progress)
+    found = _detour(problem, found, candidate_effects, progress)
+    _exchange(problem, found, candidate_effects, progress)
     if len(found.best.terms) > 1:
-        _reduce(problem, found, noise_sd)
+        _reduce(problem, found)
     if found.best.terms:
         found.best = refined(problem, found.best)
     _drop_unsure_events(problem, found, candidate_effects)
@@ -383,9 +381,7 @@ def unsure(problem: Problem, fit: Fit) -> list[Term]:
     return [term for term in amplitudes if spans[fit.first_of(term)][0] <= 0.0 <= spans[fit.first_of(term)][1]]
 
 
-def _grow(
-    problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, earned: float, progress: Progress
-) -> None:
+def _grow(problem: Problem, found: Found, candidate_effects: list[Candidate], earned: float, progress: Progress) -> None:
     """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood so far."""
     best, steps = found.best, found.steps
     rules, refits = problem.rules, 0
@@ -399,11 +395,11 @@ def _grow(
             if trials and problem.budget.spent():
                 break
             progress(f"fitting {item.candidate.key}", count / len(promising))
-            trials.append(try_fit(problem, best, item, noise_sd))
+            trials.append(try_fit(problem, best, item))
         rank(problem, trials, best)
-        trials = _with_simpler(problem, best, trials, ranked, noise_sd)
-        trials = with_wider(problem, best, trials, ranked, noise_sd)
-        with_other_recordings(problem, best, trials, noise_sd)
+        trials = _with_simpler(problem, best, trials, ranked)
+        trials = with_wider(problem, best, trials, ranked)
+        with_other_recordings(problem, best, trials)
         winner = next(
             (t for t in trials if good_enough(t, best) and weighty(t, earned) and not only_sampling(t, trials)), None
         )
@@ -424,13 +420,13 @@ def _grow(
         best = _parted(problem, _taken(problem, winner), candidate_effects)
         two = None
         if len(best.terms) == 1:
-            two, found.pairs = pair_instead(problem, found.nominal, best, trials, noise_sd, _restart)
+            two, found.pairs = pair_instead(problem, found.nominal, best, trials, _restart)
         if two is not None:
             best = _joined(problem, two)
             steps += [Step(SearchMove.JOINT, term.candidate.key, two.heldout, trials) for term in best.terms]
         if len(best.terms) > 1:
-            best = _swap(problem, best, noise_sd, steps)
-        best = _prune(problem, best, noise_sd, steps)
+            best = _swap(problem, best, steps)
+        best = _prune(problem, best, steps)
     found.best = best
 
 
@@ -475,7 +471,7 @@ def worth_fitting(problem: Problem, best: Fit, ranked: list[Screened]) -> list[S
     return _varied(enough, rules)
 
 
-def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened], noise_sd: Array) -> list[Trial]:
+def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened]) -> list[Trial]:
     """`trials`, and the simpler shapes of the first that were screened but not fitted; ranked again.
 
     A richer shape can promise more than each of the simpler ones it contains, and several rich ones fill the places of a
@@ -494,12 +490,12 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
     ]
     if not missing:
         return trials
-    more = [*trials, *(try_fit(problem, best, item, noise_sd) for item in missing[: problem.rules.simpler_fits])]
+    more = [*trials, *(try_fit(problem, best, item) for item in missing[: problem.rules.simpler_fits])]
     rank(problem, more, best)
     return more
 
 
-def with_wider(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened], noise_sd: Array) -> list[Trial]:
+def with_wider(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened]) -> list[Trial]:
     """`trials`, and wider forms of those that the data call for but that ended at a bound of their form; ranked again.
 
     A bound that is not nature's means that the form is wrong and what it stands for is near: other forms at its place are
@@ -514,12 +510,12 @@ def with_wider(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Sc
         missing += [item for item in left if item not in missing and item.candidate.port.name == port]
     if not missing or problem.budget.spent():
         return trials
-    more = [*trials, *(try_fit(problem, best, item, noise_sd) for item in missing[: problem.rules.wider_fits])]
+    more = [*trials, *(try_fit(problem, best, item) for item in missing[: problem.rules.wider_fits])]
     rank(problem, more, best)
     return more
 
 
-def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress) -> None:
+def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> None:
     """Two effects at once where none passed alone, then further ones."""
     refused = found.steps[-1].trials if found.steps else []
     if found.best.terms or len(refused) < 2 or problem.budget.spent():
@@ -534,15 +530,15 @@ def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], no
         ranked = [item for item in screen(problem, base, candidate_effects, progress) if not item.drop]
         enough = [item for item in ranked if item.promise > problem.rules.screening_log_likelihood]
         chosen = _varied(enough, problem.rules, here=2)[: problem.rules.joint_second]
-        return [try_fit(problem, base, item, noise_sd) for item in chosen]
+        return [try_fit(problem, base, item) for item in chosen]
 
-    pair = best_pair(problem, found.nominal, refused, fit_next, noise_sd, progress)
+    pair = best_pair(problem, found.nominal, refused, fit_next, progress)
     if pair is None:
         set_starts(problem, begun)
         return
     found.best = _parted(problem, _joined(problem, pair), candidate_effects)
     found.steps += [Step(SearchMove.JOINT, term.candidate.key, pair.heldout, refused) for term in found.best.terms]
-    _grow(problem, found, candidate_effects, noise_sd, pair.heldout.log_likelihood, progress)
+    _grow(problem, found, candidate_effects, pair.heldout.log_likelihood, progress)
 
 
 def _joined(problem: Problem, pair: PairFit) -> Fit:
@@ -585,9 +581,7 @@ def _parted(problem: Problem, fit: Fit, candidate_effects: list[Candidate]) -> F
     return finish(problem, Fit(tuple(terms), np.concatenate(values), cost=fit.cost))
 
 
-def _detour(
-    problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
-) -> Found:
+def _detour(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> Found:
     """One effect that stands in for two can beat each of them alone: the first step's rivals are taken up where what
     screening promises together with them would outdo all that was found.
     """
@@ -603,27 +597,24 @@ def _detour(
         ranked = screen(problem, base, candidate_effects, progress)
         if (
             not ranked
-            or _total(problem, found.nominal, base, noise_sd) + ranked[0].promise
-            < _total(problem, found.nominal, best.best, noise_sd)
-            + len(best.best.terms) * problem.rules.heldout_log_likelihood
+            or _total(problem, found.nominal, base) + ranked[0].promise
+            < _total(problem, found.nominal, best.best) + len(best.best.terms) * problem.rules.heldout_log_likelihood
         ):
             continue
         other = Found(found.nominal, base, [Step(SearchMove.FORWARD, trial.candidate.key, trial.heldout, first.trials)])
-        _grow(problem, other, candidate_effects, noise_sd, trial.both.log_likelihood, progress)
-        if _ahead(problem, other, best, noise_sd):
+        _grow(problem, other, candidate_effects, trial.both.log_likelihood, progress)
+        if _ahead(problem, other, best):
             best, begun, scale = other, get_starts(problem), problem.scale.copy()
     if above_noise(problem, best.best, problem.rules.residual_over_noise):
-        pair = pair_first(problem, found.nominal, first.trials, noise_sd, _restart, progress)
+        pair = pair_first(problem, found.nominal, first.trials, _restart, progress)
         if pair is not None:
             base = _parted(problem, _joined(problem, pair), candidate_effects)
             steps = [Step(SearchMove.JOINT, term.candidate.key, pair.heldout, first.trials) for term in base.terms]
             other = Found(found.nominal, base, steps)
-            likelier = _ahead(problem, other, best, noise_sd)
-            earned = compare(
-                problem.segments, "both", found.nominal.residuals, base.residuals, noise_sd, problem.rules
-            ).log_likelihood
-            _grow(problem, other, candidate_effects, noise_sd, earned, progress)
-            if likelier or _ahead(problem, other, best, noise_sd):
+            likelier = _ahead(problem, other, best)
+            earned = problem.gain("both", found.nominal.residuals, base.residuals).log_likelihood
+            _grow(problem, other, candidate_effects, earned, progress)
+            if likelier or _ahead(problem, other, best):
                 best, begun, scale = other, get_starts(problem), problem.scale.copy()
     set_starts(problem, begun)
     problem.scale[:] = scale
@@ -633,21 +624,21 @@ def _detour(
     return best
 
 
-def _ahead(problem: Problem, other: Found, best: Found, noise_sd: Array) -> bool:
+def _ahead(problem: Problem, other: Found, best: Found) -> bool:
     """Whether another beginning ends plainly likelier, with one effect more at most."""
-    ahead = compare(problem.segments, "both", best.best.residuals, other.best.residuals, noise_sd, problem.rules)
+    ahead = problem.gain("both", best.best.residuals, other.best.residuals)
     more = max(other.best.fitted - best.best.fitted, 0)
     least = problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
     return ahead.log_likelihood > least and len(other.best.terms) <= len(best.best.terms) + 1
 
 
-def _total(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> float:
+def _total(problem: Problem, nominal: Fit, fit: Fit) -> float:
     """Likelihood on all samples that a structure has earned, less the price of its parameters."""
-    gain = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd, problem.rules)
+    gain = problem.gain("both", nominal.residuals, fit.residuals)
     return gain.log_likelihood - problem.rules.parameter_penalty * (fit.fitted - nominal.fitted)
 
 
-def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fit:
+def _swap(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
     """Refit each effect's rivals together with the others: one that only replaced several has to leave now."""
     for term in best.terms:
         step = next((s for s in reversed(steps) if s.key == term.candidate.key), None)
@@ -658,7 +649,7 @@ def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fi
             other = finish(
                 problem, minimize(problem, (*rest, new), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
             )
-            ahead = compare(problem.segments, "both", best.residuals, other.residuals, noise_sd, problem.rules)
+            ahead = problem.gain("both", best.residuals, other.residuals)
             more = other.fitted - best.fitted
             if ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * max(
                 more, 0
@@ -668,9 +659,7 @@ def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fi
     return best
 
 
-def _exchange(
-    problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
-) -> None:
+def _exchange(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> None:
     """Each of several effects taken out, and all candidates screened again for its place: what was the best alone
     may not be the best together with the others.
     """
@@ -680,13 +669,13 @@ def _exchange(
             if term not in found.best.terms:
                 continue  # it left with another of its name (several jumps at one port), which was exchanged
             if (len(found.best.terms) > 1 or _frequencies(found.best, term)) and not problem.budget.spent():
-                _in_place_of(problem, found, term, candidate_effects, noise_sd, progress)
-        found.best = _prune(problem, found.best, noise_sd, found.steps)
+                _in_place_of(problem, found, term, candidate_effects, progress)
+        found.best = _prune(problem, found.best, found.steps)
         if found.best.names == before or len(found.best.terms) < 2:
             return
 
 
-def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
+def _reduce(problem: Problem, found: Found) -> None:
     """Each of several effects replaced by a simpler shape that does nearly as well in its place.
 
     A richer shape may have entered because the simpler one needed another effect as well: a limit of speed that is never
@@ -709,8 +698,8 @@ def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
             begin = np.concatenate((values, start))
             other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
             other = _restart(problem, finish(problem, begun_again(problem, other)), simple.candidate)
-            earned = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd, problem.rules)
-            ahead = compare(problem.segments, "both", other.residuals, found.best.residuals, noise_sd, problem.rules)
+            earned = problem.gain("both", less.residuals, found.best.residuals)
+            ahead = problem.gain("both", other.residuals, found.best.residuals)
             more = found.best.fitted - other.fitted
             if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
                 found.steps.append(Step(SearchMove.REDUCE, key, ahead, [trial]))
@@ -743,9 +732,7 @@ def _frequencies(fit: Fit, term: Term) -> tuple[float, ...]:
     return tuple(float(value) for p, value in pairs if p.spectral)
 
 
-def _in_place_of(
-    problem: Problem, found: Found, term: Term, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
-) -> None:
+def _in_place_of(problem: Problem, found: Found, term: Term, candidate_effects: list[Candidate], progress: Progress) -> None:
     known = _frequencies(found.best, term)
     less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal)
     ranked = [
@@ -757,17 +744,16 @@ def _in_place_of(
     top = max((item.promise for item in ranked), default=0.0)
     others = [item for item in ranked if item not in own and item.promise > problem.rules.exchange_promise * top]
     trials = [
-        try_fit(problem, less, item, noise_sd)
-        for item in [*own, *_varied(others, problem.rules)[: problem.rules.exchange_fits]]
+        try_fit(problem, less, item) for item in [*own, *_varied(others, problem.rules)[: problem.rules.exchange_fits]]
     ]
     rank(problem, trials, less)
-    with_other_recordings(problem, less, trials, noise_sd)
+    with_other_recordings(problem, less, trials)
     found.steps.append(Step(SearchMove.EXCHANGE, term.candidate.key, trials=trials))
     winner = next((trial for trial in trials if good_enough(trial, less)), None)
     if winner is None or winner.candidate.key == term.candidate.key:
         return
     simpler = winner.fit.fitted < found.best.fitted and related(winner.candidate, term.candidate)
-    ahead = compare(problem.segments, "both", found.best.residuals, winner.fit.residuals, noise_sd, problem.rules)
+    ahead = problem.gain("both", found.best.residuals, winner.fit.residuals)
     more = winner.fit.fitted - found.best.fitted
     if (
         simpler  # preferred by `rank`, which weighs what the finer shape takes more
@@ -814,7 +800,7 @@ def _varied(items: list[Screened], rules: SelectionRules, here: int = 0) -> list
     return kept
 
 
-def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fit:
+def _prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
     """Backward: drop what no longer earns its place."""
     dropped, rules = True, problem.rules
     while dropped and len(best.terms) > 1:
@@ -822,14 +808,14 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
         for term in best.terms:
             begun = get_starts(problem)
             less = fit_without(problem, best, (term.candidate.key,), begin_again=True)
-            gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd, problem.rules)
-            held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd, problem.rules)
+            gain = problem.gain("both", less.residuals, best.residuals)
+            held = problem.gain("heldout", less.residuals, best.residuals)
             least = max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
             price = rules.parameter_penalty * term.fitted
             few = gain.log_likelihood < rules.heldout_log_likelihood + price
             gone = vanished(best, term, rules)
             if held.log_likelihood < 0.0:
-                held = unexcited(problem, less, best, term.fitted, noise_sd, held) or held
+                held = unexcited(problem, less, best, term.fitted, held) or held
             small = gain.share < rules.removal_tolerance * least
             if gone or few or small or held.log_likelihood < 0.0:
                 best, dropped = less, True

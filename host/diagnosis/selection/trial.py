@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Problem, Term
 from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, same_place
@@ -144,8 +144,7 @@ def _compare_on_common_samples(problem: Problem, trials: list[Trial], base: Fit)
     if all(np.array_equal(mask, np.isfinite(r)) for fit in fits for mask, r in zip(seen, fit.residuals, strict=True)):
         return
     before = [np.where(mask, r, np.nan) for mask, r in zip(seen, base.residuals, strict=True)]
-    noise_sd = np.array([noise.sigma for noise in problem.noise])
-    gains = [compare(problem.segments, "both", before, trial.fit.residuals, noise_sd, problem.rules) for trial in first]
+    gains = [problem.gain("both", before, trial.fit.residuals) for trial in first]
     _scored(first, gains, base)
     first.sort(key=lambda trial: trial.score, reverse=True)
     trials[: len(first)] = first

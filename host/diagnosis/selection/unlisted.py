@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.coloured import only_coloured, too_slow
-from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.model.effect import Port
@@ -41,12 +40,12 @@ class Remainder:
         return self.above_noise or (self.predicted is not None and self.predicted.sure)
 
 
-def remaining_share(problem: Problem, found: Found, noise_sd: Array) -> float:
+def remaining_share(problem: Problem, found: Found) -> float:
     """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
     mattered most; noise may be larger than its estimate by `noise_uncertainty`, and is no larger than that remaining error.
     """
     shares, weights = [], []
-    noise_sd = _levels(problem, found.best, noise_sd)
+    noise_sd = _levels(problem, found.best)
     for row in range(noise_sd.size):
         left = _power(problem, found.best.residuals, row)
         # An effect that is there at rest too, a line in a reading, is part of the noise that was measured at rest.
@@ -59,12 +58,12 @@ def remaining_share(problem: Problem, found: Found, noise_sd: Array) -> float:
     return shares[int(np.argmax(weights))] if shares else 0.0
 
 
-def _above_noise(problem: Problem, found: Found, noise_sd: Array) -> bool:
+def _above_noise(problem: Problem, found: Found) -> bool:
     """Whether the best model leaves more than the noise of some output can be: noise known from quiescent parts, or
     guessed.
     """
     measured = problem.rules.residual_over_noise if found.best.terms else problem.rules.residual_over_noise_nominal
-    noise_sd = _levels(problem, found.best, noise_sd)
+    noise_sd = _levels(problem, found.best)
     return any(
         _power(problem, found.best.residuals, row)
         > ((measured if noise.source.seen_alone else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
@@ -75,9 +74,9 @@ def _above_noise(problem: Problem, found: Found, noise_sd: Array) -> bool:
     )
 
 
-def _levels(problem: Problem, fit: Fit, noise_sd: Array) -> Array:
+def _levels(problem: Problem, fit: Fit) -> Array:
     """Noise of each output (outputs,): where it was guessed from a spectrum, and `fit` leaves coloured noise, that noise."""
-    levels = noise_sd.copy()
+    levels = problem.noise_sd
     for row, noise in enumerate(problem.noise):
         if not noise.source.seen_alone and _power(problem, fit.residuals, row) > levels[row] ** 2:
             # What a plant does to a force inside it follows its own motion, of which no form of an input says enough.
@@ -90,14 +89,13 @@ def _levels(problem: Problem, fit: Fit, noise_sd: Array) -> Array:
     return levels
 
 
-def slow_outputs(problem: Problem, fit: Fit, noise_sd: Array) -> list[int]:
+def slow_outputs(problem: Problem, fit: Fit) -> list[int]:
     """Rows of outputs of which `fit` leaves noise so slow that these data cannot separate it from a mismatch."""
-    rules, levels = problem.rules, _levels(problem, fit, noise_sd)
+    rules, levels = problem.rules, _levels(problem, fit)
     return [
         row
-        for row in range(noise_sd.size)
-        if levels[row] > rules.residual_over_guessed_noise * noise_sd[row]
-        and too_slow([r[row] for r in fit.residuals], rules)
+        for row, sigma in enumerate(problem.noise_sd)
+        if levels[row] > rules.residual_over_guessed_noise * sigma and too_slow([r[row] for r in fit.residuals], rules)
     ]
 
 
@@ -108,18 +106,18 @@ def _power(problem: Problem, residuals: list[Array], row: int) -> float:
     return float(np.mean(together**2)) if together.size else 0.0
 
 
-def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress: Progress) -> Remainder:
+def explain_remainder(problem: Problem, found: Found, progress: Progress) -> Remainder:
     """Test the remaining residual, and add an equation to `found.best` where one earns its place."""
     ports = {port.name: port for port in problem.model.ports}
     pairs = {a: (ports[a], ports[b]) for a, b in problem.model.unlisted_at}
     progress("testing whether the residual is predictable", 0.0)
     late = None if found.best.terms else within_sample(found.last_trials, found.best)
     if late is not None:
-        past = _past(problem, found, late, noise_sd)
+        past = _past(problem, found, late)
         if not past.sure:
             return past
-    places = _places(problem, found, noise_sd)
-    remainder = _remainder(problem, found, noise_sd, places)
+    places = _places(problem, found)
+    remainder = _remainder(problem, found, places)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
     if (
         not remainder.sure
@@ -129,45 +127,41 @@ def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress:
         return remainder
     likely = sorted((p for p in places if p.port is not None and p.sure), key=lambda place: -place.log_likelihood)
     for number, place in enumerate([place.port.name for place in likely if place.port is not None]):
-        if not problem.budget.spent() and _equation_instead(
-            problem, found, noise_sd, *pairs[place], progress, evolve=number == 0
-        ):
-            return remainder_of(problem, found, noise_sd)
+        if not problem.budget.spent() and _equation_instead(problem, found, *pairs[place], progress, evolve=number == 0):
+            return remainder_of(problem, found)
     # Several effects that pile up and still do not fit stand for something that is in no list.
     return replace(remainder, doubtful=bool(crowd))
 
 
-def _past(problem: Problem, found: Found, late: Trial, noise_sd: Array) -> Remainder:
+def _past(problem: Problem, found: Found, late: Trial) -> Remainder:
     """The remainder past a delay within one sample: how the input was held, which no effect is named for."""
     begun = get_starts(problem)
     set_starts(problem, late.starts)
-    remainder = remainder_of(problem, replace(found, best=late.fit), noise_sd)
+    remainder = remainder_of(problem, replace(found, best=late.fit))
     set_starts(problem, begun)
     return remainder
 
 
-def remainder_of(problem: Problem, found: Found, noise_sd: Array) -> Remainder:
+def remainder_of(problem: Problem, found: Found) -> Remainder:
     """Return what the best model leaves, without a search for its equation."""
-    return _remainder(problem, found, noise_sd, _places(problem, found, noise_sd))
+    return _remainder(problem, found, _places(problem, found))
 
 
-def _places(problem: Problem, found: Found, noise_sd: Array) -> list[PredictedPart]:
+def _places(problem: Problem, found: Found) -> list[PredictedPart]:
     """What forms of the inputs predict of the residual; nothing where most of it is noise, which these inputs hold."""
     of_noise = problem.noise_passed > problem.rules.noise_passed_share and not found.best.terms
-    return [] if of_noise else predict_residual(problem, found.best, noise_sd)
+    return [] if of_noise else predict_residual(problem, found.best)
 
 
-def _remainder(problem: Problem, found: Found, noise_sd: Array, places: list[PredictedPart]) -> Remainder:
+def _remainder(problem: Problem, found: Found, places: list[PredictedPart]) -> Remainder:
     best = max(places, key=lambda place: (place.sure, place.log_likelihood), default=None)
-    explained = fallen(problem, found.nominal.residuals, found.best.residuals, noise_sd)
+    explained = fallen(problem, found.nominal.residuals, found.best.residuals)
     predicted_share = best.power / (explained + best.power) if best is not None and best.power > 0.0 else 0.0
-    left = max(remaining_share(problem, found, noise_sd), predicted_share)
-    return Remainder(best, left, above_noise=_above_noise(problem, found, noise_sd))
+    left = max(remaining_share(problem, found), predicted_share)
+    return Remainder(best, left, above_noise=_above_noise(problem, found))
 
 
-def _equation_instead(
-    problem: Problem, found: Found, noise_sd: Array, port: Port, target: Port, progress: Progress, evolve: bool
-) -> bool:
+def _equation_instead(problem: Problem, found: Found, port: Port, target: Port, progress: Progress, evolve: bool) -> bool:
     """Puts an equation in the place of all effects at its port, if it earns its place and does better than they.
 
     `evolve`: search by genetic programming too, where no form of the library says it all.
@@ -175,22 +169,22 @@ def _equation_instead(
     progress("searching an equation", 0.0)
     there = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.name in (port.name, target.name))
     base = fit_without(problem, found.best, there, tolerance=1e-7) if there else found.best
-    sized = [form for place in predict_residual(problem, base, noise_sd) if place.port is port for form in place.forms]
-    trials = [_tried(problem, base, noise_sd, target, form, size) for form, size in sized]
+    sized = [form for place in predict_residual(problem, base) if place.port is port for form in place.forms]
+    trials = [_tried(problem, base, target, form, size) for form, size in sized]
     forms = [form for form, _ in sized]
     rank(problem, trials, base)
     winner = next((trial for trial in trials if _earned(trial) and not _only_sampling(problem, trial)), None)
-    if evolve and (winner is None or _left(problem, found, winner.fit, noise_sd) > problem.rules.partial_share):
+    if evolve and (winner is None or _left(problem, found, winner.fit) > problem.rules.partial_share):
         evolved = search_equation(problem, base, port)
-        trials += [_tried(problem, base, noise_sd, target, form, 1.0) for form in evolved]
+        trials += [_tried(problem, base, target, form, 1.0) for form in evolved]
         forms += evolved
         rank(problem, trials, base)
         winner = next((trial for trial in trials if _earned(trial) and not _only_sampling(problem, trial)), None)
-    if winner is None or not _better_than_known(problem, found, noise_sd, winner, bool(there)):
+    if winner is None or not _better_than_known(problem, found, winner, bool(there)):
         return False
-    if _left(problem, found, winner.fit, noise_sd) > problem.rules.equation_residual_share:
+    if _left(problem, found, winner.fit) > problem.rules.equation_residual_share:
         return False
-    if there and _still_earned(problem, found.best, winner, noise_sd):
+    if there and _still_earned(problem, found.best, winner):
         return False
     found.forms += [form for form in forms if form.text == winner.candidate.effect.equation]
     found.steps.append(Step(SearchMove.EQUATION, winner.candidate.key, winner.heldout, trials))
@@ -199,19 +193,19 @@ def _equation_instead(
     return True
 
 
-def _still_earned(problem: Problem, best: Fit, winner: Trial, noise_sd: Array) -> bool:
+def _still_earned(problem: Problem, best: Fit, winner: Trial) -> bool:
     """Whether the effects that an equation would replace gain as much together with it as they must to enter: then they
     stay.
     """
     term = winner.fit.terms[-1]
     begin = np.concatenate((best.values, winner.fit.values_of(term)))
     both = finish(problem, minimize(problem, (*best.terms, term), begin, rounds=8, tolerance=1e-4))
-    gain = compare(problem.segments, "heldout", winner.fit.residuals, both.residuals, noise_sd, problem.rules)
+    gain = problem.gain("heldout", winner.fit.residuals, both.residuals)
     more = both.fitted - winner.fit.fitted
     return gain.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
 
 
-def equations_for(problem: Problem, less: Fit, port: Port, noise_sd: Array) -> list[Trial]:
+def equations_for(problem: Problem, less: Fit, port: Port) -> list[Trial]:
     """The best forms of the library at `port`, or at the one whose reading it is, each refitted with `less`."""
     here = port.within or port.name
     target = next((b for a, b in problem.model.unlisted_at if here in (a, b)), None)
@@ -219,10 +213,8 @@ def equations_for(problem: Problem, less: Fit, port: Port, noise_sd: Array) -> l
         return []
     ports = {p.name: p for p in problem.model.ports}
     name = next(a for a, b in problem.model.unlisted_at if b == target)
-    sized = [form for place in predict_residual(problem, less, noise_sd, name) for form in place.forms]
-    return [
-        _tried(problem, less, noise_sd, ports[target], form, size) for form, size in sized[: problem.rules.equation_fits]
-    ]
+    sized = [form for place in predict_residual(problem, less, name) for form in place.forms]
+    return [_tried(problem, less, ports[target], form, size) for form, size in sized[: problem.rules.equation_fits]]
 
 
 def _earned(trial: Trial) -> bool:
@@ -249,22 +241,20 @@ def _only_sampling(problem: Problem, trial: Trial) -> bool:
     )
 
 
-def _tried(problem: Problem, base: Fit, noise_sd: Array, target: Port, form: Form, size: float) -> Trial:
+def _tried(problem: Problem, base: Fit, target: Port, form: Form, size: float) -> Trial:
     lay_out(problem.segments, form)
     candidate = equation_at(target, form, size)
-    return try_fit(
-        problem, base, Screened(candidate, term_of(problem, candidate, base), (), 1.0, [np.array([size])]), noise_sd
-    )
+    return try_fit(problem, base, Screened(candidate, term_of(problem, candidate, base), (), 1.0, [np.array([size])]))
 
 
-def _left(problem: Problem, found: Found, fit: Fit, noise_sd: Array) -> float:
-    return remaining_share(problem, replace(found, best=fit), noise_sd)
+def _left(problem: Problem, found: Found, fit: Fit) -> float:
+    return remaining_share(problem, replace(found, best=fit))
 
 
-def _better_than_known(problem: Problem, found: Found, noise_sd: Array, winner: Trial, instead: bool) -> bool:
+def _better_than_known(problem: Problem, found: Found, winner: Trial, instead: bool) -> bool:
     """Whether an equation beats the known effects it takes the place of, or else all those that were tried and refused."""
     if instead:
-        gain = compare(problem.segments, "heldout", found.best.residuals, winner.fit.residuals, noise_sd, problem.rules)
+        gain = problem.gain("heldout", found.best.residuals, winner.fit.residuals)
         return gain.log_likelihood > problem.rules.heldout_log_likelihood
     last = found.steps[-1].trials if found.steps else []
     return all(

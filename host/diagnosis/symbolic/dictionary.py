@@ -16,7 +16,6 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import RAN_AWAY, Fit, Problem, Term, free, size_of
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, Context, Effect, Parameter, Port, Scale
@@ -213,7 +212,7 @@ def lay_out(segments: list[Segment], form: Form) -> None:
         segment.equations[form.text] = form.evaluate(segment)
 
 
-def predict_residual(problem: Problem, fit: Fit, noise_sd: Array, only: str = "") -> list[PredictedPart]:
+def predict_residual(problem: Problem, fit: Fit, only: str = "") -> list[PredictedPart]:
     """The best forms at each port where an equation may stand, and, if the model has many outputs, in each of them alone;
     or at the port `only`.
     """
@@ -227,11 +226,11 @@ def predict_residual(problem: Problem, fit: Fit, noise_sd: Array, only: str = ""
         forms = forms_at(problem, fit, ports[name])
         if forms:
             responses = _responses(problem, fit, ports[target], forms)
-            found.append(_best(problem, fit, noise_sd, rates, forms, responses, ports[name].subsystem, ports[name]))
+            found.append(_best(problem, fit, rates, forms, responses, ports[name].subsystem, ports[name]))
             if problem.model.pointwise and not only:
                 table = [r.table for r in responses]
                 found += [
-                    _best(problem, fit, noise_sd, rates, forms, _alone(problem, row, table), output.subsystem, None)
+                    _best(problem, fit, rates, forms, _alone(problem, row, table), output.subsystem, None)
                     for row, output in enumerate(problem.model.outputs)
                     if used[row] and name == problem.model.unlisted_at[0][0]
                 ]
@@ -318,7 +317,6 @@ def _finite(change: Array, problem: Problem) -> Array:
 def _best(
     problem: Problem,
     fit: Fit,
-    noise_sd: Array,
     slopes: list[Array],
     forms: list[Form],
     responses: list[Response],
@@ -326,7 +324,7 @@ def _best(
     port: Port | None,
 ) -> PredictedPart:
     """Greedy choice among `forms`, one more as long as held-out samples are predicted better."""
-    rules, sums = problem.rules, _Sums(problem, fit, noise_sd, slopes, responses)
+    rules, sums = problem.rules, _Sums(problem, fit, slopes, responses)
     best = PredictedPart(subsystem, port, 0.0, 1.0, 0.0, 0.0)
     chosen: list[int] = []
     worth: tuple[tuple[Form, float], ...] = ()
@@ -343,13 +341,13 @@ def _best(
                 r - response.to([*chosen, k], sizes) + np.tensordot(sums.absorbed([*chosen, k], sizes), slope, 1)
                 for r, response, slope in zip(fit.residuals, responses, slopes, strict=True)
             ]
-            tried.append((compare(problem.segments, "heldout", fit.residuals, after, noise_sd, problem.rules), k, after))
+            tried.append((problem.gain("heldout", fit.residuals, after), k, after))
         held, k, after = max(tried, key=lambda one: one[0].log_likelihood)
         chosen = [*chosen, k]
         likelihood = held.log_likelihood - len(chosen) * (1.0 + np.log(len(tried)))
         if likelihood > best.log_likelihood:
-            trained = compare(problem.segments, "fit", fit.residuals, after, noise_sd, problem.rules).log_likelihood
-            power = fallen(problem, fit.residuals, after, noise_sd)
+            trained = problem.gain("fit", fit.residuals, after).log_likelihood
+            power = fallen(problem, fit.residuals, after)
             best = PredictedPart(subsystem, port, likelihood, held.p_value, held.share, trained, worth, power)
     sure = (
         min(best.log_likelihood, best.trained) > rules.predictable_log_likelihood
@@ -359,9 +357,10 @@ def _best(
     return replace(best, forms=worth, sure=sure)
 
 
-def fallen(problem: Problem, before: list[Array], after: list[Array], noise_sd: Array) -> float:
+def fallen(problem: Problem, before: list[Array], after: list[Array]) -> float:
     """Fall of the mean squared error on held-out samples, over each output's noise, summed over those where it fell."""
     total = 0.0
+    noise_sd = problem.noise_sd
     for row in range(noise_sd.size):
         pairs = [(b[row][p.heldout], a[row][p.heldout]) for p, b, a in zip(problem.segments, before, after, strict=True)]
         change = np.concatenate([b**2 - a**2 for b, a in pairs])
@@ -388,8 +387,8 @@ def _weights(r: Array) -> Array:
 class _Sums:
     """Inner products, over the samples to fit and in units of noise, of forms, parameters and residual."""
 
-    def __init__(self, problem: Problem, fit: Fit, noise_sd: Array, slopes: list[Array], responses: list[Response]) -> None:
-        unit = np.maximum(noise_sd, 1e-100)[:, None]  # its square is a number too: recordings without noise exist
+    def __init__(self, problem: Problem, fit: Fit, slopes: list[Array], responses: list[Response]) -> None:
+        unit = np.maximum(problem.noise_sd, 1e-100)[:, None]  # its square is a number too: recordings without noise exist
         count, rates = len(responses[0].table), len(slopes[0])
         gram, cross, pull = np.zeros((count, count)), np.zeros((count, rates)), np.zeros(count)
         own, start = np.zeros((rates, rates)), np.zeros(rates)

@@ -84,15 +84,14 @@ def test_where_a_form_ends_at_its_bound_a_wider_one_is_fitted() -> None:
     tables = [Table(f"r{k}", pressed(k, 1.0, yields_m=5e-4)) for k in range(2)]
     model, problem, _ = prepare(nominal_of(PRESS), tables)
     nominal = fit_nominal(problem)
-    noise_sd = np.array([noise.sigma for noise in problem.noise])
     ranked = screen(problem, nominal, candidates(model.ports, True, model.taken), lambda *_: None)
     dry = next(item for item in ranked if item.candidate.key == "coulomb_friction@press(bristles)")
-    refused = try_fit(problem, nominal, dry, noise_sd)
+    refused = try_fit(problem, nominal, dry)
     assert at_bound(refused.fit) and called_for(refused, nominal)
-    trials = with_wider(problem, nominal, [refused], ranked, noise_sd)
+    trials = with_wider(problem, nominal, [refused], ranked)
     assert trials[0].candidate.effect.id == "presliding_friction" and not at_bound(trials[0].fit)
     fine = [trial for trial in trials if not at_bound(trial.fit)]
-    assert with_wider(problem, nominal, fine[:1], ranked, noise_sd) == fine[:1]  # nothing at a bound: nothing more to fit
+    assert with_wider(problem, nominal, fine[:1], ranked) == fine[:1]  # nothing at a bound: nothing more to fit
 
 
 @pytest.mark.slow
