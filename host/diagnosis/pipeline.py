@@ -47,12 +47,14 @@ from host.diagnosis.selection.equivalence import (
     with_unlisted_rival,
     without_improbable,
 )
+from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.frozen_inputs import without_frozen
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.readings_apart import readings_apart
+from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
 from host.diagnosis.selection.screening import without
-from host.diagnosis.selection.search import Found, concluded, fit_nominal, forward, search
+from host.diagnosis.selection.search import concluded, forward, search
 from host.diagnosis.selection.trial import Trial, within_sample
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out

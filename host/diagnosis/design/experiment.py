@@ -20,8 +20,8 @@ from host.diagnosis.estimation.fit import Fit, Problem, jacobian, minimize, size
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, alike_everywhere
 from host.diagnosis.selection.equivalence import Standing
+from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.screening import without
-from host.diagnosis.selection.search import Found
 
 Array = npt.NDArray[np.float64]
 LONGEST_S, MOST_SAMPLES = 40.0, 12000

@@ -17,7 +17,7 @@ held-out ones and on both, with a p-value over held-out blocks of four correlati
 
 Decision. Forward selection: candidates are screened by projection on the residual past all active parameters, the best
 are fitted in full, and the best of these enters if its evidence passes `SelectionRules`. A finer form of an active effect
-takes its place. Backward elimination: an effect that no longer earns its place leaves. Exchange: each effect is taken out
+takes its place. Backward elimination: an effect that no longer earns its place leaves (`removal`). Exchange: each effect is taken out
 and all candidates are tried in its place; the second-best first effects are tried as starts. What remains is put to
 simple forms of the recorded signals and to symbolic regression (`unlisted`). Rivals that the data do not separate are
 listed (`equivalence`), and everything that was fitted gets its probability (`posterior`).

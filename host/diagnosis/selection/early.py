@@ -21,8 +21,9 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.model import Model, Segment
 from host.diagnosis.model.operators import fill
 from host.diagnosis.model.readings import Finding
+from host.diagnosis.selection.refits import fit_nominal, settle, settled, try_fit
 from host.diagnosis.selection.screening import enough, screen
-from host.diagnosis.selection.search import fit_nominal, settle, settled, try_fit, worth_fitting
+from host.diagnosis.selection.search import worth_fitting
 
 Array = npt.NDArray[np.float64]
 LONGEST_SHARE = 0.1  # of the shortest recording, and

@@ -13,9 +13,11 @@ from host.diagnosis.estimation.initial_state import begun_again
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.folds import unexcited
+from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.posterior import Posterior, ahead_of_rival, coarse, posterior
+from host.diagnosis.selection.refits import fit_without, refined
+from host.diagnosis.selection.removal import unsure
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.search import Found, SearchMove, Step, fit_without, refined, unsure
 from host.diagnosis.selection.trial import Trial, at_bound, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at

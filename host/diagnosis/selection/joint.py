@@ -11,13 +11,12 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, get_starts, minimize, set_starts
-from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.refits import restarted
 from host.diagnosis.selection.screening import above_noise
 from host.diagnosis.selection.trial import Trial, bound_by, related, sure_together
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
-Restart = Callable[[Problem, Fit, Candidate], Fit]
 FitNext = Callable[[Fit, list[dict[str, float]]], list[Trial]]
 
 
@@ -75,16 +74,13 @@ def best_pair(problem: Problem, nominal: Fit, trials: list[Trial], fit_next: Fit
     return max(found, key=lambda pair: pair.score, default=None)
 
 
-def pair_instead(
-    problem: Problem, nominal: Fit, one: Fit, trials: list[Trial], restart: Restart
-) -> tuple[PairFit | None, list[Fit]]:
+def pair_instead(problem: Problem, nominal: Fit, one: Fit, trials: list[Trial]) -> tuple[PairFit | None, list[Fit]]:
     """Two effects in the place of the one in `one`, whose formula joins effects of unlike kinds; None if they do no better.
     Then the pairs that do as well: no data tell them from it.
 
     A loop with a dead band both rests after a reversal and is late. It outdoes play or a delay alone where both are there,
     and hides them: past it, neither earns much. Pairs of an effect that it contains and any unlike one at its port have to
-    be likelier than it is. The arguments are those of `best_pair`; restart: fits again
-    with the memory of a candidate started, in each recording, where that recording fits best.
+    be likelier than it is. The arguments are those of `best_pair`.
     """
     rules, term = problem.rules, one.terms[0]
     here = [t for t in _singles(trials, len(trials)) if t.candidate.port.name == term.candidate.port.name]
@@ -100,7 +96,7 @@ def pair_instead(
     ]
     begun, found, equal = get_starts(problem), [], []
     for a, b in tried[: rules.split_fits]:
-        fit = _fitted_anew(problem, nominal, a, b, restart)
+        fit = _fitted_anew(problem, nominal, a, b)
         passed = _passed(problem, nominal, fit, get_starts(problem))
         ahead = problem.gain("both", one.residuals, fit.residuals)
         more = fit.fitted - one.fitted
@@ -116,7 +112,7 @@ def pair_instead(
     return best, equal if best is None else []
 
 
-def pair_first(problem: Problem, nominal: Fit, trials: list[Trial], restart: Restart, progress: Progress) -> PairFit | None:
+def pair_first(problem: Problem, nominal: Fit, trials: list[Trial], progress: Progress) -> PairFit | None:
     """The likeliest pair of unlike effects that were tried in the first step, one of them at a place along a loaded link;
     None if no pair passes.
 
@@ -137,7 +133,7 @@ def pair_first(problem: Problem, nominal: Fit, trials: list[Trial], restart: Res
         if problem.budget.spent():
             break
         progress(f"fitting {a.candidate.key} and {b.candidate.key}", count / len(tried))
-        fit = _fitted_anew(problem, nominal, a, b, restart)
+        fit = _fitted_anew(problem, nominal, a, b)
         passed = _passed(problem, nominal, fit, get_starts(problem))
         if passed is not None and all(_earned_over(problem, fit, t.fit) for t in (a, b)):
             found.append(passed)
@@ -180,12 +176,12 @@ def _fitted(problem: Problem, nominal: Fit, a: Trial, b: Trial) -> Fit:
     return finish(problem, minimize(problem, terms, fit.values, rounds=rules.further_iterations, tolerance=1e-4))
 
 
-def _fitted_anew(problem: Problem, nominal: Fit, a: Trial, b: Trial, restart: Restart) -> Fit:
+def _fitted_anew(problem: Problem, nominal: Fit, a: Trial, b: Trial) -> Fit:
     """Both effects together, the memory of each started again: alone it began with something else than past the other."""
     set_starts(problem, [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)])
     fit = _fitted(problem, nominal, a, b)
     for which in (a, b):
-        fit = restart(problem, fit, which.candidate)
+        fit = restarted(problem, fit, which.candidate)
     return fit
 
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.readings import Finding
+from host.diagnosis.selection.refits import fit_nominal, try_fit
 from host.diagnosis.selection.screening import screen
-from host.diagnosis.selection.search import fit_nominal, try_fit
 from host.diagnosis.selection.trial import Trial
 
 

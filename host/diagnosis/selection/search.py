@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import Gain
-from host.diagnosis.estimation.feedback import find_feedback
 from host.diagnosis.estimation.fit import (
     Fit,
     Problem,
@@ -23,16 +19,16 @@ from host.diagnosis.estimation.fit import (
     robust,
     set_starts,
 )
-from host.diagnosis.estimation.initial_state import STATE_STEPS, begun_again, fit_with_states, start_again
-from host.diagnosis.estimation.instants import placed
+from host.diagnosis.estimation.initial_state import start_again
 from host.diagnosis.estimation.rules import SelectionRules
-from host.diagnosis.estimation.uncertainty import intervals
-from host.diagnosis.model.effect import Candidate, rate_key
-from host.diagnosis.model.model import Segment
-from host.diagnosis.selection.folds import unexcited, with_other_recordings
+from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.folds import with_other_recordings
+from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.joint import PairFit, best_pair, pair_first, pair_instead
+from host.diagnosis.selection.refits import fit_nominal, fit_without, refined, settled, try_fit
+from host.diagnosis.selection.removal import drop_unsure, drop_unsure_events, prune, reduce
 from host.diagnosis.selection.restart import hidden
-from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, term_of, without
+from host.diagnosis.selection.screening import Screened, above_noise, screen, term_of, without
 from host.diagnosis.selection.trial import (
     Trial,
     at_bound,
@@ -41,257 +37,12 @@ from host.diagnosis.selection.trial import (
     only_sampling,
     rank,
     related,
-    richer_gain,
-    vanished,
     weighty,
     wider,
 )
-from host.diagnosis.symbolic.dictionary import Form
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
-
-
-class SearchMove(Enum):
-    """What one step of the search did with the effect of its key."""
-
-    FORWARD = "it entered"
-    UPGRADE = "it entered in the place of a simpler form"
-    JOINT = "it entered together with another one"
-    SWAP = "it took the place of another one"
-    REDUCE = "it took the place of a more general form"
-    EQUATION = "an equation entered"
-    EXCHANGE = "it stayed: no other one does better in its place"
-    REFIT = "the model before it was fitted again from the nominal parameters found with it"
-    STOP = "no effect earned its place"
-    BACKWARD = "removed again"
-    UNSURE = "removed: its interval contains zero"
-    IMPROBABLE = "removed: it is improbable next to the others"
-
-    @property
-    def removes(self) -> bool:
-        """Whether the effect left the model."""
-        return self in (SearchMove.BACKWARD, SearchMove.UNSURE, SearchMove.IMPROBABLE)
-
-
-@dataclass
-class Step:
-    """One step of the search, for the report."""
-
-    move: SearchMove
-    key: str
-    gain: Gain | None = None  # none where no gain decided
-    trials: list[Trial] = field(default_factory=list)
-
-
-@dataclass
-class Found:
-    """Nominal fit, best fit, the moves between, trials fitted with the best structure, and its equations."""
-
-    nominal: Fit
-    best: Fit
-    steps: list[Step]
-    forms: list[Form] = field(default_factory=list)
-    pairs: list[Fit] = field(default_factory=list)  # of two effects each, that do as well as the first one named
-
-    @property
-    def last_trials(self) -> list[Trial]:
-        """Trials of the last step that had any."""
-        return next((step.trials for step in reversed(self.steps) if step.trials), [])
-
-
-def settle(problem: Problem, values: Array) -> None:
-    """Lets a model that needs it prepare its recordings for these nominal parameters."""
-    for segment in problem.segments:
-        problem.model.settle(segment, values)
-    start_again(problem, Fit((), values))
-
-
-def refined(problem: Problem, fit: Fit) -> Fit:
-    """`fit` brought to its end on all samples, together with the states that recordings begin from."""
-    fit = begun_again(problem, fit)
-    for _ in range(2 if any(segment.begin is not None for segment in problem.segments) else 1):
-        start_again(problem, fit)
-        fit = minimize(problem, fit.terms, fit.values, states=not problem.joint_states)
-    if not problem.joint_states:
-        start_again(problem, fit)
-    return placed(problem, finish(problem, fit))
-
-
-def fit_without(
-    problem: Problem,
-    fit: Fit,
-    keys: tuple[str, ...],
-    *,
-    nominal: Fit | None = None,
-    rounds: int = 8,
-    tolerance: float = 1e-4,
-    begin_again: bool = False,
-) -> Fit:
-    """`fit` without the effects of these `keys`: what remains is fitted again from its values.
-
-    nominal: returned instead where no effect remains. rounds, tolerance: of `minimize`. begin_again: whether a model that is
-    a linear path is also given initial states of its own.
-    """
-    terms, values = without(fit, problem, keys)
-    if not terms and nominal is not None:
-        return nominal
-    less = minimize(problem, terms, values, rounds=rounds, tolerance=tolerance)
-    return finish(problem, begun_again(problem, less) if begin_again else less)
-
-
-def fit_nominal(problem: Problem) -> Fit:
-    """Nominal parameters refitted on all samples to fit; sets the weights of outputs and the start of memories.
-
-    A model that takes a measured output as an input too (`settle`) has it freed of noise before each fit, with what it
-    simulates itself:
-    errors in a variable that the fit takes for exact would bend its parameters.
-    """
-    fit = Fit((), problem.model.guess(problem.segments))
-    for _ in range(3):
-        settle(problem, fit.values)
-        reweigh(problem, fit)
-        fit = minimize(problem, (), fit.values, states=True)
-    fit = settled(problem, begun_again(problem, fit))
-    fed = find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs, problem.rules)
-    problem.noise_fed = fed and _at_noise(problem, fit)
-    problem.noise_passed = _of_inputs(problem, fit)
-    return fit
-
-
-def _of_inputs(problem: Problem, fit: Fit) -> float:
-    """Share of the residual's variance that noise of measured inputs makes through the nominal law, in the output where that
-    is most.
-    """
-    residual, passed = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
-    for segment, r in zip(problem.segments, fit.residuals, strict=True):
-        residual += np.nansum(r**2, axis=1)
-        passed += np.sum(np.isfinite(r), axis=1) * problem.model.noise_of_inputs(segment, fit.values) ** 2
-    return float(np.max(np.minimum(passed / np.maximum(residual, 1e-300), 1.0)))
-
-
-def _at_noise(problem: Problem, fit: Fit) -> bool:
-    """Whether a fit leaves no more than noise of the model's own differences can be, in all recordings together."""
-    ratios = []
-    for segment, residual in zip(problem.segments, fit.residuals, strict=True):
-        noise = problem.model.noise_of(segment)
-        if noise is not None:
-            ratios.append(float(np.nanmean(residual**2)) / noise.sigma**2)
-    return bool(ratios) and float(np.mean(ratios)) < problem.rules.residual_over_noise_nominal**2
-
-
-def try_fit(problem: Problem, base: Fit, item: Screened) -> Trial:
-    """Full joint refit of one candidate from its best starts."""
-    terms, values = without(base, problem, item.drop)
-    few = enough(problem)
-    begins = [np.concatenate((values, b)) for b in item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]]
-    if item.nominal:
-        begins = [np.concatenate(both) for both in zip(item.nominal, item.begin, strict=True)]
-    fits = [
-        minimize(few, (*terms, item.term), begin, rounds=problem.rules.first_iterations, tolerance=1e-4) for begin in begins
-    ]
-    fit = min(fits, key=lambda f: f.cost)
-    alone = not problem.joint_states  # the other models are begun again together with their parameters
-    fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4, states=alone)
-    begun = get_starts(problem)
-    fit = begun_again(problem, fit)
-    if any(a is not b for a, b in zip(few.segments, problem.segments, strict=True)):
-        fit = minimize(problem, fit.terms, fit.values, rounds=1)
-    if alone:
-        start_again(problem, fit)  # also of held-out recordings: the state of the model so far is not this one's
-    fit = finish(problem, fit)
-    fit = placed(problem, _restart(problem, fit, fit.terms[-1].candidate))
-    after = get_starts(problem)
-    set_starts(problem, begun)
-    heldout = problem.gain("heldout", base.residuals, fit.residuals)
-    trained = problem.gain("fit", base.residuals, fit.residuals)
-    both = problem.gain("both", base.residuals, fit.residuals)
-    return Trial(
-        fit.terms[-1].candidate,
-        fit,
-        heldout,
-        trained,
-        both,
-        both.log_likelihood - problem.rules.parameter_penalty * (fit.fitted - base.fitted),
-        after,
-        bool(item.drop),
-        problem.segments[0].recording.dt_s,
-        problem.rules,
-        problem.apart,
-        any(segment.repeats for segment in problem.segments),
-        problem.noise_passed if fit.terms[-1].candidate.effect.cancels_noise else 0.0,
-    )
-
-
-def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
-    """Refit with the memory at the candidate's port started, in each recording, where that recording fits best."""
-    if not candidate.effect.remembers:
-        return fit
-    port = candidate.port.name
-    for _ in range(0 if candidate.effect.memories else 2):
-        before = get_starts(problem)
-        reach = 2.0 * max(max(abs(start.get(port, 0.0)) for start in before), _need_rms(problem, fit, candidate))
-        for segment in problem.segments:
-            _best_start(problem, fit, segment, port, reach)
-            if candidate.effect.begins_with_speed:
-                x = problem.model.motion(segment, candidate.port)
-                hurry = float(np.std(np.gradient(x, segment.recording.dt_s))) / max(float(np.std(x)), 1e-300)
-                for key, most in ((rate_key(port), reach * hurry), (port, reach)):
-                    _best_start(problem, fit, segment, key, most)
-        trial = minimize(problem, fit.terms, fit.values, rounds=6, tolerance=1e-4)
-        if not trial.cost < fit.cost:
-            set_starts(problem, before)
-            break
-        better = trial.cost < 0.98 * fit.cost
-        fit = finish(problem, trial)
-        if not better:
-            break
-    return _memory_and_values(problem, fit) if candidate.effect.timed and not problem.joint_states else fit
-
-
-def _memory_and_values(problem: Problem, fit: Fit) -> Fit:
-    """`fit` with its parameters and the starts of its memories moved together, if that lowers its cost.
-
-    In turn they hardly move where a memory fades slowly: the start holds what the parameters leave, and they follow it.
-    """
-    before = get_starts(problem)
-    trial = fit_with_states(problem, fit, STATE_STEPS)
-    trial = minimize(problem, trial.terms, trial.values, rounds=6, tolerance=1e-4)
-    if trial.cost < fit.cost:
-        return finish(problem, trial)
-    set_starts(problem, before)
-    return fit
-
-
-def _need_rms(problem: Problem, fit: Fit, candidate: Candidate) -> float:
-    n = len(problem.model.parameters)
-    needs = [
-        problem.model.needs(segment, candidate.port, fit.values[:n], r)
-        for segment, r in zip(problem.segments, fit.residuals, strict=True)
-    ]
-    return float(np.sqrt(np.nanmean(np.concatenate(needs) ** 2)))
-
-
-def _best_start(problem: Problem, fit: Fit, segment: Segment, port: str, reach: float) -> None:
-    """Start of memory at `port` that leaves the least error in `segment`: a scan over [-reach, reach], then its best
-    cell halved.
-    """
-
-    def error(start: float) -> float:
-        segment.start[port] = start
-        r = problem.left(segment, fit.terms, fit.values) / problem.scale[:, None]
-        return float(np.nansum(np.minimum(r * r, 16.0)))
-
-    old = segment.start.get(port, 0.0)
-    tried = {float(s): error(float(s)) for s in (*np.linspace(-reach, reach, 9), old)}
-    step = 0.125 * reach
-    for _ in range(4):
-        middle = min(tried, key=lambda s: tried[s])
-        for s in (middle - step, middle + step):
-            tried[s] = error(s)
-        step *= 0.5
-    best = min(tried, key=lambda s: tried[s])
-    segment.start[port] = best if tried[best] < 0.9999 * tried[old] else old
 
 
 def search(problem: Problem, candidate_effects: list[Candidate], progress: Progress, earned: float = 0.0) -> Found:
@@ -317,68 +68,12 @@ def concluded(problem: Problem, found: Found, candidate_effects: list[Candidate]
     found = _detour(problem, found, candidate_effects, progress)
     _exchange(problem, found, candidate_effects, progress)
     if len(found.best.terms) > 1:
-        _reduce(problem, found)
+        reduce(problem, found)
     if found.best.terms:
         found.best = refined(problem, found.best)
-    _drop_unsure_events(problem, found, candidate_effects)
+    drop_unsure_events(problem, found, candidate_effects)
     drop_unsure(problem, found)
     return found
-
-
-def drop_unsure(problem: Problem, found: Found) -> None:
-    """Drops effects of one amplitude whose interval contains zero.
-
-    The evidence counts independent samples. Where an effect was called for in some parts of the recordings only, or by a
-    few, the jackknife of its interval shows that they do not agree on it.
-    """
-    while doubtful := unsure(problem, found.best):
-        terms, values = without(found.best, problem, (doubtful[-1].candidate.key,))
-        found.steps.append(Step(SearchMove.UNSURE, doubtful[-1].candidate.key))
-        found.best = refined(problem, minimize(problem, terms, values)) if terms else fit_nominal(problem)
-
-
-def _drop_unsure_events(problem: Problem, found: Found, candidate_effects: list[Candidate]) -> None:
-    """Takes events whose size has an interval that contains zero out of an effect of several, one after the other."""
-    for _ in range(problem.rules.most_effects):
-        fit, spans = found.best, intervals(problem, found.best) if found.best.terms else []
-        for term in fit.terms:
-            first, events = fit.first_of(term), _events(term)
-            sizes = [k - 1 for k in events if len(events) > 1 and spans[first + k - 1][0] <= 0.0 <= spans[first + k - 1][1]]
-            fewer = _with_events(problem, fit, term, candidate_effects, len(events) - 1) if sizes else None
-            if fewer is not None:
-                smallest = min(sizes, key=lambda k: abs(fit.values[first + k]))
-                values = np.delete(fit.values, [first + smallest, first + smallest + 1])
-                terms = tuple(fewer if other is term else other for other in fit.terms)
-                found.steps.append(Step(SearchMove.UNSURE, term.candidate.key))
-                found.best = refined(problem, minimize(problem, terms, values))
-                break
-        else:
-            return
-
-
-def _events(term: Term) -> list[int]:
-    """Places of the instants among the parameters of a term; the size of each event is before its instant."""
-    return [k for k, p in enumerate(term.parameters) if p.event]
-
-
-def _with_events(problem: Problem, fit: Fit, term: Term, candidate_effects: list[Candidate], count: int) -> Term | None:
-    """The effect of `term` at its port in the form that has `count` events; None where it has no such form."""
-    own = term.candidate
-    for candidate in candidate_effects:
-        if (candidate.effect.id, candidate.port.name, candidate.source) == (own.effect.id, own.port.name, own.source):
-            other = term_of(problem, candidate, fit)
-            if len(_events(other)) == count:
-                return other
-    return None
-
-
-def unsure(problem: Problem, fit: Fit) -> list[Term]:
-    """Terms of one amplitude whose interval contains zero."""
-    amplitudes = [term for term in fit.terms if len(term.parameters) == 1 and term.parameters[0].linear]
-    if not amplitudes:
-        return []
-    spans = intervals(problem, fit)
-    return [term for term in amplitudes if spans[fit.first_of(term)][0] <= 0.0 <= spans[fit.first_of(term)][1]]
 
 
 def _grow(problem: Problem, found: Found, candidate_effects: list[Candidate], earned: float, progress: Progress) -> None:
@@ -420,13 +115,13 @@ def _grow(problem: Problem, found: Found, candidate_effects: list[Candidate], ea
         best = _parted(problem, _taken(problem, winner), candidate_effects)
         two = None
         if len(best.terms) == 1:
-            two, found.pairs = pair_instead(problem, found.nominal, best, trials, _restart)
+            two, found.pairs = pair_instead(problem, found.nominal, best, trials)
         if two is not None:
             best = _joined(problem, two)
             steps += [Step(SearchMove.JOINT, term.candidate.key, two.heldout, trials) for term in best.terms]
         if len(best.terms) > 1:
             best = _swap(problem, best, steps)
-        best = _prune(problem, best, steps)
+        best = prune(problem, best, steps)
     found.best = best
 
 
@@ -447,15 +142,6 @@ def _better_base(problem: Problem, base: Fit, trial: Trial) -> Fit | None:
         reweigh(problem, again)
         return again
     return settled(problem, again)
-
-
-def settled(problem: Problem, fit: Fit) -> Fit:
-    """A nominal fit with its residuals; outputs weighted by it, and initial states estimated from it."""
-    settle(problem, fit.values)
-    reweigh(problem, fit)
-    finish(problem, fit)
-    set_starts(problem, first_needs(problem, fit))
-    return fit
 
 
 def worth_fitting(problem: Problem, best: Fit, ranked: list[Screened]) -> list[Screened]:
@@ -606,7 +292,7 @@ def _detour(problem: Problem, found: Found, candidate_effects: list[Candidate], 
         if _ahead(problem, other, best):
             best, begun, scale = other, get_starts(problem), problem.scale.copy()
     if above_noise(problem, best.best, problem.rules.residual_over_noise):
-        pair = pair_first(problem, found.nominal, first.trials, _restart, progress)
+        pair = pair_first(problem, found.nominal, first.trials, progress)
         if pair is not None:
             base = _parted(problem, _joined(problem, pair), candidate_effects)
             steps = [Step(SearchMove.JOINT, term.candidate.key, pair.heldout, first.trials) for term in base.terms]
@@ -670,59 +356,9 @@ def _exchange(problem: Problem, found: Found, candidate_effects: list[Candidate]
                 continue  # it left with another of its name (several jumps at one port), which was exchanged
             if (len(found.best.terms) > 1 or _frequencies(found.best, term)) and not problem.budget.spent():
                 _in_place_of(problem, found, term, candidate_effects, progress)
-        found.best = _prune(problem, found.best, found.steps)
+        found.best = prune(problem, found.best, found.steps)
         if found.best.names == before or len(found.best.terms) < 2:
             return
-
-
-def _reduce(problem: Problem, found: Found) -> None:
-    """Each of several effects replaced by a simpler shape that does nearly as well in its place.
-
-    A richer shape may have entered because the simpler one needed another effect as well: a limit of speed that is never
-    reached outdoes the lag that it contains by chance alone. What the richer one takes more has to be what a richer one
-    has to take to be preferred where single effects are ranked (`rank`).
-    """
-    for term in found.best.terms:
-        if problem.budget.spent():
-            return
-        if not any(term is other for other in found.best.terms):
-            continue  # it left with another of its name, which was reduced
-        for trial in _simpler(found, term):
-            rest, values = without(found.best, problem, (term.candidate.key,))
-            simple = trial.fit.terms[-1]
-            own = {p.name: float(value) for p, value in zip(term.parameters, found.best.values_of(term), strict=True)}
-            alone = zip(simple.parameters, trial.fit.values_of(simple), strict=True)
-            begun, key = get_starts(problem), simple.candidate.key
-            less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal)
-            start = np.array([min(max(own.get(p.name, float(value)), p.low), p.high) for p, value in alone])
-            begin = np.concatenate((values, start))
-            other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
-            other = _restart(problem, finish(problem, begun_again(problem, other)), simple.candidate)
-            earned = problem.gain("both", less.residuals, found.best.residuals)
-            ahead = problem.gain("both", other.residuals, found.best.residuals)
-            more = found.best.fitted - other.fitted
-            if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
-                found.steps.append(Step(SearchMove.REDUCE, key, ahead, [trial]))
-                found.best = other
-                break
-            set_starts(problem, begun)
-
-
-def _simpler(found: Found, term: Term) -> list[Trial]:
-    """Trials of the simpler shapes that `term` contains, at its place, each once."""
-    active = {t.candidate.key for t in found.best.terms}
-    kept: dict[str, Trial] = {}
-    for step in reversed(found.steps):
-        for trial in step.trials:
-            own = trial.fit.terms[-1]
-            if (
-                trial.candidate.effect.id in term.candidate.effect.contains
-                and related(trial.candidate, term.candidate)
-                and own.fitted < term.fitted
-                and trial.candidate.key not in active
-            ):
-                kept.setdefault(trial.candidate.key, trial)
-    return sorted(kept.values(), key=lambda trial: trial.fit.terms[-1].fitted)
 
 
 def _frequencies(fit: Fit, term: Term) -> tuple[float, ...]:
@@ -798,28 +434,3 @@ def _varied(items: list[Screened], rules: SelectionRules, here: int = 0) -> list
             if len(kept) == rules.fits_per_step:
                 return kept
     return kept
-
-
-def _prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
-    """Backward: drop what no longer earns its place."""
-    dropped, rules = True, problem.rules
-    while dropped and len(best.terms) > 1:
-        dropped = False
-        for term in best.terms:
-            begun = get_starts(problem)
-            less = fit_without(problem, best, (term.candidate.key,), begin_again=True)
-            gain = problem.gain("both", less.residuals, best.residuals)
-            held = problem.gain("heldout", less.residuals, best.residuals)
-            least = max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
-            price = rules.parameter_penalty * term.fitted
-            few = gain.log_likelihood < rules.heldout_log_likelihood + price
-            gone = vanished(best, term, rules)
-            if held.log_likelihood < 0.0:
-                held = unexcited(problem, less, best, term.fitted, held) or held
-            small = gain.share < rules.removal_tolerance * least
-            if gone or few or small or held.log_likelihood < 0.0:
-                best, dropped = less, True
-                steps.append(Step(SearchMove.BACKWARD, term.candidate.key, held))
-                break
-            set_starts(problem, begun)
-    return best

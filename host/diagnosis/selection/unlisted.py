@@ -13,8 +13,9 @@ from host.diagnosis.estimation.coloured import only_coloured, too_slow
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.model.effect import Port
+from host.diagnosis.selection.found import Found, SearchMove, Step
+from host.diagnosis.selection.refits import fit_without, try_fit
 from host.diagnosis.selection.screening import Screened, term_of
-from host.diagnosis.selection.search import Found, SearchMove, Step, fit_without, try_fit
 from host.diagnosis.selection.trial import Trial, rank, within_sample
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at, fallen, lay_out, predict_residual
 from host.diagnosis.symbolic.equation_search import search_equation

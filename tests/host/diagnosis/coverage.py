@@ -13,8 +13,8 @@ from host.diagnosis.estimation.known import chosen
 from host.diagnosis.estimation.uncertainty import intervals
 from host.diagnosis.model.nominal import effect_of, read_nominal
 from host.diagnosis.pipeline import prepare
+from host.diagnosis.selection.refits import fit_nominal, refined
 from host.diagnosis.selection.screening import term_of
-from host.diagnosis.selection.search import fit_nominal, refined
 from tests.host.diagnosis import planted
 
 CASES = {

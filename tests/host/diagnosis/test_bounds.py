@@ -17,8 +17,10 @@ from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import prepare
 from host.diagnosis.selection import search
+from host.diagnosis.selection.found import Found
+from host.diagnosis.selection.refits import fit_nominal, try_fit
 from host.diagnosis.selection.screening import screen
-from host.diagnosis.selection.search import Found, fit_nominal, try_fit, with_wider
+from host.diagnosis.selection.search import with_wider
 from host.diagnosis.selection.trial import at_bound, called_for, wider
 from tests.host.proof import everyday
 
@@ -114,7 +116,7 @@ def test_several_effects_of_one_name_may_leave_together(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(search, "_in_place_of", exchanged)
     problem: Any = SimpleNamespace(rules=RULES, budget=Budget())
-    search._exchange(problem, found, [], np.zeros(1), lambda *_: None)
+    search._exchange(problem, found, [], lambda *_: None)
     assert asked == [first] and found.best.terms == (other,)
 
 

@@ -15,8 +15,8 @@ from host.diagnosis.model.effect import Candidate, Context, Effect, Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import candidate_ports, prepare
+from host.diagnosis.selection.refits import fit_nominal, refined
 from host.diagnosis.selection.screening import replaced_by, term_of
-from host.diagnosis.selection.search import fit_nominal, refined
 
 Array = np.ndarray
 DT_S, GAIN, TAU_S, NOISE = 0.01, 2.0, 0.15, 0.005

@@ -13,7 +13,7 @@ from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import NothingToCompare, inspected, prepare
-from host.diagnosis.selection.search import fit_nominal
+from host.diagnosis.selection.refits import fit_nominal
 
 GEAR: dict[str, Any] = {
     "name": "gear",

@@ -20,7 +20,7 @@ from host.diagnosis.model.readings import Finding
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import at_full_rate, inspected, problems
 from host.diagnosis.selection.frozen_inputs import without_frozen
-from host.diagnosis.selection.search import fit_nominal
+from host.diagnosis.selection.refits import fit_nominal
 
 Array = np.ndarray
 T = np.arange(2000) * 0.01

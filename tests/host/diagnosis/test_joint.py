@@ -9,7 +9,7 @@ import pytest
 
 from host.diagnosis import diagnose
 from host.diagnosis.selection import search
-from host.diagnosis.selection.search import SearchMove
+from host.diagnosis.selection.found import SearchMove
 from tests.host.proof import everyday as make
 
 

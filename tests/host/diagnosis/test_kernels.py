@@ -16,7 +16,7 @@ from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.models.axis import stages
 from host.diagnosis.models.rig_kernel import Handle, Loads, ShaftBuild, Wall, contact, matrices, rotation_logs, shapes
 from host.diagnosis.pipeline import prepare
-from host.diagnosis.selection.search import fit_nominal
+from host.diagnosis.selection.refits import fit_nominal
 from tests.host.diagnosis import rig_cases
 
 

@@ -17,8 +17,10 @@ from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import prepare
+from host.diagnosis.selection.found import Found
+from host.diagnosis.selection.refits import fit_nominal, refined
+from host.diagnosis.selection.removal import drop_unsure
 from host.diagnosis.selection.screening import term_of
-from host.diagnosis.selection.search import Found, drop_unsure, fit_nominal, refined
 from tests.host.proof import everyday as make
 
 Columns = dict[str, np.ndarray]

@@ -14,7 +14,8 @@ from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import inspected, prepare
 from host.diagnosis.selection.readings_apart import readings_apart
-from host.diagnosis.selection.search import fit_nominal, search
+from host.diagnosis.selection.refits import fit_nominal
+from host.diagnosis.selection.search import search
 
 pytestmark = pytest.mark.slow  # together: each takes some seconds
 

@@ -13,8 +13,10 @@ from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import prepare
 from host.diagnosis.selection.equivalence import standings
+from host.diagnosis.selection.found import Found
+from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.selection.screening import screen
-from host.diagnosis.selection.search import Found, _exchange, _grow, fit_nominal
+from host.diagnosis.selection.search import _exchange, _grow
 from tests.host.diagnosis import planted
 
 Array = np.ndarray

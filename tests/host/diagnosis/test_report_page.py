@@ -9,7 +9,7 @@ import pytest
 
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.report.page import candidates
-from host.diagnosis.selection.search import SearchMove, Step
+from host.diagnosis.selection.found import SearchMove, Step
 
 
 def rows(*steps: Step) -> list[tuple[str, str, str]]:

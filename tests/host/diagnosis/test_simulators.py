@@ -22,8 +22,8 @@ from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import candidate_ports, prepare
 from host.diagnosis.selection.readings_apart import readings_apart
+from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.selection.screening import screen
-from host.diagnosis.selection.search import fit_nominal
 from protocol.errors import InputError
 from tests.host.diagnosis import test_forces
 
@@ -126,7 +126,7 @@ def test_every_recording_may_have_an_offset_of_its_own() -> None:
     for k, offset in enumerate((0.01, -0.02)):
         columns = recorded(k, 0.0, 1200)
         given.append({**columns, "x": columns["x"] + offset})
-    from host.diagnosis.selection.search import fit_nominal, refined
+    from host.diagnosis.selection.refits import fit_nominal, refined
 
     _, problem, _ = prepare(nominal_of(nominal), tables(*given))
     fit = refined(problem, fit_nominal(problem))

@@ -21,9 +21,11 @@ from host.diagnosis.pipeline import candidate_ports, prepare
 from host.diagnosis.report.verdict import at_bound, likelier
 from host.diagnosis.selection import equivalence
 from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival, without_improbable
+from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.posterior import ahead_of_rival, calibrated, posterior
+from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.selection.screening import Screened, term_of
-from host.diagnosis.selection.search import Found, SearchMove, Step, _varied, fit_nominal
+from host.diagnosis.selection.search import _varied
 from host.diagnosis.selection.trial import Trial, good_enough, only_sampling, weighty
 from host.diagnosis.selection.unlisted import Remainder
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at

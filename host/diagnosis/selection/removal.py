@@ -1,0 +1,146 @@
+"""Backward moves: effects that no longer earn their place, that are not sure, or that a simpler shape replaces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, get_starts, minimize, set_starts
+from host.diagnosis.estimation.initial_state import begun_again
+from host.diagnosis.estimation.uncertainty import intervals
+from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.folds import unexcited
+from host.diagnosis.selection.found import Found, SearchMove, Step
+from host.diagnosis.selection.refits import fit_nominal, fit_without, refined, restarted
+from host.diagnosis.selection.screening import term_of, without
+from host.diagnosis.selection.trial import Trial, at_bound, related, richer_gain, vanished
+
+
+def prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
+    """Backward: drop what no longer earns its place."""
+    dropped, rules = True, problem.rules
+    while dropped and len(best.terms) > 1:
+        dropped = False
+        for term in best.terms:
+            begun = get_starts(problem)
+            less = fit_without(problem, best, (term.candidate.key,), begin_again=True)
+            gain = problem.gain("both", less.residuals, best.residuals)
+            held = problem.gain("heldout", less.residuals, best.residuals)
+            least = max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
+            price = rules.parameter_penalty * term.fitted
+            few = gain.log_likelihood < rules.heldout_log_likelihood + price
+            gone = vanished(best, term, rules)
+            if held.log_likelihood < 0.0:
+                held = unexcited(problem, less, best, term.fitted, held) or held
+            small = gain.share < rules.removal_tolerance * least
+            if gone or few or small or held.log_likelihood < 0.0:
+                best, dropped = less, True
+                steps.append(Step(SearchMove.BACKWARD, term.candidate.key, held))
+                break
+            set_starts(problem, begun)
+    return best
+
+
+def reduce(problem: Problem, found: Found) -> None:
+    """Each of several effects replaced by a simpler shape that does nearly as well in its place.
+
+    A richer shape may have entered because the simpler one needed another effect as well: a limit of speed that is never
+    reached outdoes the lag that it contains by chance alone. What the richer one takes more has to be what a richer one
+    has to take to be preferred where single effects are ranked (`rank`).
+    """
+    for term in found.best.terms:
+        if problem.budget.spent():
+            return
+        if not any(term is other for other in found.best.terms):
+            continue  # it left with another of its name, which was reduced
+        for trial in _simpler(found, term):
+            rest, values = without(found.best, problem, (term.candidate.key,))
+            simple = trial.fit.terms[-1]
+            own = {p.name: float(value) for p, value in zip(term.parameters, found.best.values_of(term), strict=True)}
+            alone = zip(simple.parameters, trial.fit.values_of(simple), strict=True)
+            begun, key = get_starts(problem), simple.candidate.key
+            less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal)
+            start = np.array([min(max(own.get(p.name, float(value)), p.low), p.high) for p, value in alone])
+            begin = np.concatenate((values, start))
+            other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
+            other = restarted(problem, finish(problem, begun_again(problem, other)), simple.candidate)
+            earned = problem.gain("both", less.residuals, found.best.residuals)
+            ahead = problem.gain("both", other.residuals, found.best.residuals)
+            more = found.best.fitted - other.fitted
+            if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
+                found.steps.append(Step(SearchMove.REDUCE, key, ahead, [trial]))
+                found.best = other
+                break
+            set_starts(problem, begun)
+
+
+def _simpler(found: Found, term: Term) -> list[Trial]:
+    """Trials of the simpler shapes that `term` contains, at its place, each once."""
+    active = {t.candidate.key for t in found.best.terms}
+    kept: dict[str, Trial] = {}
+    for step in reversed(found.steps):
+        for trial in step.trials:
+            own = trial.fit.terms[-1]
+            if (
+                trial.candidate.effect.id in term.candidate.effect.contains
+                and related(trial.candidate, term.candidate)
+                and own.fitted < term.fitted
+                and trial.candidate.key not in active
+            ):
+                kept.setdefault(trial.candidate.key, trial)
+    return sorted(kept.values(), key=lambda trial: trial.fit.terms[-1].fitted)
+
+
+def drop_unsure(problem: Problem, found: Found) -> None:
+    """Drops effects of one amplitude whose interval contains zero.
+
+    The evidence counts independent samples. Where an effect was called for in some parts of the recordings only, or by a
+    few, the jackknife of its interval shows that they do not agree on it.
+    """
+    while doubtful := unsure(problem, found.best):
+        terms, values = without(found.best, problem, (doubtful[-1].candidate.key,))
+        found.steps.append(Step(SearchMove.UNSURE, doubtful[-1].candidate.key))
+        found.best = refined(problem, minimize(problem, terms, values)) if terms else fit_nominal(problem)
+
+
+def unsure(problem: Problem, fit: Fit) -> list[Term]:
+    """Terms of one amplitude whose interval contains zero."""
+    amplitudes = [term for term in fit.terms if len(term.parameters) == 1 and term.parameters[0].linear]
+    if not amplitudes:
+        return []
+    spans = intervals(problem, fit)
+    return [term for term in amplitudes if spans[fit.first_of(term)][0] <= 0.0 <= spans[fit.first_of(term)][1]]
+
+
+def drop_unsure_events(problem: Problem, found: Found, candidate_effects: list[Candidate]) -> None:
+    """Takes events whose size has an interval that contains zero out of an effect of several, one after the other."""
+    for _ in range(problem.rules.most_effects):
+        fit, spans = found.best, intervals(problem, found.best) if found.best.terms else []
+        for term in fit.terms:
+            first, events = fit.first_of(term), _events(term)
+            sizes = [k - 1 for k in events if len(events) > 1 and spans[first + k - 1][0] <= 0.0 <= spans[first + k - 1][1]]
+            fewer = _with_events(problem, fit, term, candidate_effects, len(events) - 1) if sizes else None
+            if fewer is not None:
+                smallest = min(sizes, key=lambda k: abs(fit.values[first + k]))
+                values = np.delete(fit.values, [first + smallest, first + smallest + 1])
+                terms = tuple(fewer if other is term else other for other in fit.terms)
+                found.steps.append(Step(SearchMove.UNSURE, term.candidate.key))
+                found.best = refined(problem, minimize(problem, terms, values))
+                break
+        else:
+            return
+
+
+def _events(term: Term) -> list[int]:
+    """Places of the instants among the parameters of a term; the size of each event is before its instant."""
+    return [k for k, p in enumerate(term.parameters) if p.event]
+
+
+def _with_events(problem: Problem, fit: Fit, term: Term, candidate_effects: list[Candidate], count: int) -> Term | None:
+    """The effect of `term` at its port in the form that has `count` events; None where it has no such form."""
+    own = term.candidate
+    for candidate in candidate_effects:
+        if (candidate.effect.id, candidate.port.name, candidate.source) == (own.effect.id, own.port.name, own.source):
+            other = term_of(problem, candidate, fit)
+            if len(_events(other)) == count:
+                return other
+    return None
