@@ -36,7 +36,7 @@ from host.diagnosis.model.spectral_line import common_line, distorted
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
-from host.diagnosis.selection.between_recordings import unlike_recordings
+from host.diagnosis.selection.between_recordings import inadequate, unlike_recordings
 from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
 from host.diagnosis.selection.early import early_outputs
 from host.diagnosis.selection.equivalence import (
@@ -57,6 +57,7 @@ from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import concluded, forward, search
 from host.diagnosis.selection.trial import Trial, within_sample
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
+from host.diagnosis.selection.within_recordings import changed_within
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
@@ -267,8 +268,8 @@ def _diagnosed(
     while fewer := without_improbable(problem, found, standing, remainder):
         standing, remainder = fewer
     probable = max((probability_of(one, remainder.share, problem.rules).effect for one in standing), default=0.0)
-    unlike = probable < problem.rules.further_probability and not budget.spent()
-    between = unlike_recordings(problem, found.nominal) if unlike else []
+    same = found.best if probable >= problem.rules.further_probability else found.nominal
+    between = [] if budget.spent() else _parameters_differ(full, problem, found.nominal, same)
     if between and found.best.terms:
         found.best, standing = fit_nominal(problem), []
     standing = with_unlisted_rival(standing, remainder)
@@ -312,6 +313,23 @@ def _diagnosed(
         result.located = [_unexplained(full, fits, remainder.predicted.subsystem)]
     overall.end()
     return result
+
+
+def _parameters_differ(full: Problem, problem: Problem, nominal: Fit, same: Fit) -> list[Finding]:
+    """What shows that the recordings, or two parts of one, have different nominal parameters.
+
+    same: the best model that has the same parameters throughout.
+    """
+    rival = inadequate(problem, same)
+    if rival is None:
+        return []
+    whole = [segment.recording for segment in full.segments]
+    factor = thinning(problem.model, whole) if full is not problem else 1
+
+    def prepared(recordings: list[Recording]) -> Problem:
+        return _problem(problem.model, [thin(r, factor) for r in recordings], problem.columns, problem.rules)
+
+    return unlike_recordings(problem, nominal, rival) or changed_within(problem, nominal, rival, whole, prepared)
 
 
 def _by_motion(spec: NominalSpec) -> NominalSpec:

@@ -21,7 +21,15 @@ from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
 # Findings on what these data cannot decide, the most important one first.
 UNDECIDED = ("line", "noise_fed_back", "noise_passed_on", "slow_noise", "noise_unseen", "within_sample", "excitation")
-REMARKS = ("outliers", "quantized", "hold", "repeated", "session", *UNDECIDED)  # findings that ask for no change of the data
+REMARKS = (
+    "outliers",
+    "quantized",
+    "hold",
+    "repeated",
+    "session",
+    "changed",
+    *UNDECIDED,
+)  # findings that ask for no change of the data
 
 
 def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
@@ -116,6 +124,8 @@ def _unexplained(result: Diagnosis) -> str:
     """What to do about a residual that no effect explains; empty where there is none."""
     if any(f.id == "session" for f in result.findings):
         return "Find what was changed between the recordings, or diagnose those that agree with each other apart."
+    if any(f.id == "changed" for f in result.findings):
+        return "Find what was changed at that time, or cut the recording there and diagnose the parts apart."
     if (
         result.verdict == "mismatch_not_identified"
         and result.spec.linear is not None

@@ -15,10 +15,10 @@ residual that is correlated counts as n / tau independent samples, tau its integ
 Evidence. The gain of one model over another is sum over outputs of n / (2 tau) log(MSE / MSE'), on samples to fit, on
 held-out ones and on both, with a p-value over held-out blocks of four correlation times (t test and signed ranks).
 
-Decision. Forward selection: candidates are screened by projection on the residual past all active parameters, the best
-are fitted in full, and the best of these enters if its evidence passes `SelectionRules`. A finer form of an active effect
-takes its place. Backward elimination: an effect that no longer earns its place leaves (`removal`). Exchange: each effect is taken out
-and all candidates are tried in its place; the second-best first effects are tried as starts. What remains is put to
+Decision. Forward selection: candidates are screened by projection on the residual past all active parameters, the best are
+fitted in full, and the best of these enters if its evidence passes `SelectionRules`. A finer form of an active effect takes
+its place. Backward elimination: an effect that no longer earns its place leaves (`removal`). Exchange: each effect is taken
+out and all candidates are tried in its place; the second-best first effects are tried as starts. What remains is put to
 simple forms of the recorded signals and to symbolic regression (`unlisted`). Rivals that the data do not separate are
 listed (`equivalence`), and everything that was fitted gets its probability (`posterior`).
 """
