@@ -15,10 +15,7 @@ from threadpoolctl import threadpool_limits
 from host.diagnosis.design.experiment import Design, design
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation import noise as noise_module
-from host.diagnosis.estimation.coloured import independent_samples
-from host.diagnosis.estimation.evidence import whiteness
 from host.diagnosis.estimation.fit import Fit, Problem
-from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
@@ -28,11 +25,10 @@ from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording, load, read_tables, thin
 from host.diagnosis.model.effect import Candidate, Port
 from host.diagnosis.model.findings import Finding, Inspected, inspect
-from host.diagnosis.model.model import Model, Segment
+from host.diagnosis.model.model import Model
 from host.diagnosis.model.nominal import EffectSpec, NominalSpec
 from host.diagnosis.model.pairs import driven_of
 from host.diagnosis.model.progress import Overall
-from host.diagnosis.model.spectral_line import common_line, distorted
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
@@ -49,52 +45,28 @@ from host.diagnosis.selection.equivalence import (
 )
 from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.frozen_inputs import without_frozen
-from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
+from host.diagnosis.selection.full_rate import Figures, FullRate, at_full_rate, figures_of, fits_at_full_rate
+from host.diagnosis.selection.locate import Location, locate, unexplained
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.refits import fit_nominal
+from host.diagnosis.selection.remarks import (
+    above_guess,
+    jumps_in_level,
+    lines_in_spectrum,
+    noise_of_motion,
+    read_seldom,
+    slow_noise,
+)
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
-from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import concluded, forward, search
 from host.diagnosis.selection.trial import Trial, within_sample
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
 from host.diagnosis.selection.within_recordings import changed_within
-from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
-
-
-@dataclass
-class Location:
-    """One subsystem with a mismatch: where and when."""
-
-    subsystem: str
-    channels: list[str]
-    windows_s: dict[str, list[tuple[float, float]]]  # of every recording, in its file's own time
-    condition: Condition | None
-    residual_share: float
-
-
-@dataclass(frozen=True)
-class FullRate:
-    """The nominal and the best fit with their residuals on all samples of the recordings."""
-
-    nominal: Fit
-    best: Fit
-
-
-@dataclass
-class Figures:
-    """RMSE on held-out samples at full rate, per output."""
-
-    before: Array
-    after: Array
-    noise_sd: Array
-    white_before: Array
-    white_after: Array
-    primary: int
 
 
 @dataclass
@@ -275,15 +247,15 @@ def _diagnosed(
     standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)
-    fits = _fits_at_full_rate(full, found, problem)
-    located, figures = _locate(full, found, fits), _figures(full, fits)
+    fits = fits_at_full_rate(full, found, problem)
+    located, figures = locate(full, found, fits), figures_of(full, fits)
     result = Diagnosis(spec, model, problem, full, found, fits, standing, spans, located, figures)
     result.remainder = remainder
     result.findings = [
         *data.findings,
         *done.findings,
-        *_fed_back(problem),
-        *_repeated(full),
+        *noise_of_motion(problem),
+        *read_seldom(full),
         *between,
         *idle_inputs(problem, found.best),
         *uncertain(problem, found.best, spans),
@@ -291,7 +263,7 @@ def _diagnosed(
     ]
     result.findings.sort(key=lambda finding: finding.id != "frozen")  # it is to be corrected before anything else
     if not found.best.terms and remainder.sure:
-        result.findings += _jumps(full, fits)
+        result.findings += jumps_in_level(full, fits)
     result.designs = [] if budget.spent() else design(problem, found, standing, overall.part(0.9, 1.0))
     result.stopped_early = budget.spent()
     piled = remainder.doubtful and len(found.best.terms) > problem.rules.partial_effects
@@ -304,13 +276,13 @@ def _diagnosed(
         else "nothing_missing"
     )
     if not found.best.terms:
-        result.findings += _lines(full, fits)
+        result.findings += lines_in_spectrum(full, fits)
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best)
         late = any(finding.id == "within_sample" for finding in done.findings)  # it explains what exceeds the noise
-        result.findings += _too_slow(full, fits, slow) or ([] if late else _above_guess(full, figures, problem.rules))
+        result.findings += slow_noise(full, fits, slow) or ([] if late else above_guess(full, figures, problem.rules))
     if not located and remainder.sure and remainder.predicted is not None:
-        result.located = [_unexplained(full, fits, remainder.predicted.subsystem)]
+        result.located = [unexplained(full, fits, remainder.predicted.subsystem)]
     overall.end()
     return result
 
@@ -510,266 +482,8 @@ def _without_lone_samples(
     return outliers_of_residual(full, at_full_rate(full, nominal, problem), recordings)
 
 
-def _repeated(full: Problem) -> list[Finding]:
-    """Sentences on sensors that are read more seldom than they are logged."""
-    findings = []
-    for row, output in enumerate(full.model.outputs):
-        segment = next((segment for segment in full.segments if row in segment.repeats), None)
-        if segment is None:
-            continue
-        column = full.columns.get(output.channel, output.channel)
-        samples = int(np.median(np.diff(np.unique(segment.repeats[row]))))
-        period = samples * segment.recording.dt_s
-        timed = f", every {period:.4g} s" if segment.recording.timed else ""
-        says = (
-            f"Column {column} repeats each reading for {samples} samples{timed}: its sensor is read more seldom than it is "
-        )
-        says += "logged. The simulated readings are repeated likewise. A delay up to this period may be the sensor's."
-        findings.append(Finding("repeated", column, says))
-    return findings
-
-
-def _lines(full: Problem, fits: FullRate) -> list[Finding]:
-    """Sentences on lines in the spectrum of the nominal residual that no effect explains."""
-    if not full.segments[0].recording.timed:
-        return []
-    findings = []
-    periods = [segment.recording.dt_s for segment in full.segments]
-    read = {output.channel for output in full.model.outputs}
-    inputs = [
-        [u for name, u in segment.inputs.items() if name in segment.recording.channels and name not in read]
-        for segment in full.segments
-    ]
-    for row, output in enumerate(full.model.outputs):
-        residuals = [r[row] for r in fits.nominal.residuals]
-        simulated = [segment.y[row] - r for segment, r in zip(full.segments, residuals, strict=True)]
-        known = [[*own, *distorted(said)] for own, said in zip(inputs, simulated, strict=True)]
-        line = common_line(residuals, known, simulated, periods, full.rules.data)
-        if line is None:
-            continue
-        column = full.columns.get(output.channel, output.channel)
-        says = f"The residual of column {column} has a sine of {line.frequency_Hz:.4g} Hz, amplitude {line.amplitude:.3g} "
-        says += (
-            f"{output.unit}, in every recording. No input has this frequency, and the simulated output hardly moves at it: "
-        )
-        says += "a hum, a vibration or a rotating part is not in the nominal model."
-        findings.append(Finding("line", column, says))
-    return findings
-
-
-def _fed_back(problem: Problem) -> list[Finding]:
-    """A sentence where effects were not tried because the residual is noise of the motion, which a law with memory cancels:
-    a controller fed it back into the input, or the nominal law passes it on.
-    """
-    names = [problem.columns.get(name, name) for name in problem.model.quiet_inputs]
-    if problem.noise_passed > problem.rules.noise_passed_share and not problem.noise_fed:
-        says = (
-            f"The noise of column {names[0]} makes most of the residual, through the nominal law. No delay, lag, resonance "
-        )
-        says += "or second mass was tried: a law with memory can cancel this noise, so these recordings cannot show one. "
-        says += "Read the motion with less noise, or record slower motions."
-        return [Finding("noise_passed_on", names[0], says)]
-    if not problem.noise_fed:
-        return []
-    says = f"A controller computes column {names[0]} from the recorded motion, whose noise is most of the residual. No "
-    says += "delay, lag, resonance or second mass was tried: a law with memory can cancel this noise, so these recordings "
-    says += "cannot show one. Record in open loop, or read the motion with less noise."
-    return [Finding("noise_fed_back", names[0], says)]
-
-
-def _too_slow(full: Problem, fits: FullRate, rows: list[int]) -> list[Finding]:
-    """Sentences on outputs whose residual wanders so slowly that it is noise or a mismatch, and data cannot tell which."""
-    findings = []
-    for row in rows:
-        output, residuals = full.model.outputs[row], [r[row] for r in fits.best.residuals]
-        column = full.columns.get(output.channel, output.channel)
-        says = f"The residual of column {column}, {rms(residuals):.3g} {output.unit} RMS, has only "
-        says += f"{independent_samples(residuals):.0f} independent samples. No structure is common to the recordings. "
-        says += "These data cannot separate slow noise from a mismatch: record five times as long, or repeat the motion."
-        findings.append(Finding("slow_noise", column, says))
-    return findings
-
-
-def _above_guess(full: Problem, figures: Figures, rules: SelectionRules) -> list[Finding]:
-    """Sentences on outputs whose residual is larger than a noise that was never seen alone: it may be noise all the same."""
-    findings = []
-    for output, left, noise in zip(full.model.outputs, figures.after, full.noise, strict=True):
-        if noise.source.seen_alone or not left > rules.residual_over_noise * noise.sigma:
-            continue
-        column = full.columns.get(output.channel, output.channel)
-        ratio = left / max(noise.sigma, 1e-300)
-        says = f"The residual of column {column}, {left:.3g} {output.unit} RMS, is {ratio:.2g} times the noise that its "
-        says += "spectrum suggests. The noise was never recorded alone, so this may be slower noise, or a mismatch that no "
-        says += "effect explains: record some seconds at rest, or the same motion twice."
-        findings.append(Finding("noise_unseen", column, says))
-    return findings
-
-
-def _jumps(full: Problem, fits: FullRate) -> list[Finding]:
-    """Sentences on jumps of the nominal residual that no effect explains, such as those of a sensor that was moved."""
-    findings = []
-    for row, output in enumerate(full.model.outputs):
-        jumps = jumps_of([r[row] for r in fits.nominal.residuals], full.rules)
-        if not jumps:
-            continue
-        places = []
-        for jump in jumps:
-            recording = full.segments[jump.recording].recording
-            at = recording.begin_s + float(recording.time_s[jump.sample])
-            places.append(
-                f"{jump.size:+.3g} {output.unit} at {at:.4g} {'s' if recording.timed else 'samples'} of {recording.name}"
-            )
-        column = full.columns.get(output.channel, output.channel)
-        says = f"The level of column {column} jumps past what the nominal model predicts: {'; '.join(places)}. "
-        says += "A sensor was moved, or an axis lost steps: an event, not a law of the model. It is not corrected."
-        findings.append(Finding("jump", column, says))
-    return findings
-
-
 def candidate_ports(problem: Problem) -> tuple[Port, ...]:
     """Ports of the model, each with those at which a linear time-invariant effect does the same."""
     first = next(segment for segment in problem.segments if segment.fit.any())
     path = problem.model.linear_path(first, problem.model.guess(problem.segments))
     return tuple(replace(port, path=path) if port.name in path else port for port in problem.model.ports)
-
-
-def _unexplained(full: Problem, fits: FullRate, subsystem: str) -> Location:
-    """Where the refitted nominal model fails, if no effect explains it."""
-    residuals, rules = fits.nominal.residuals, full.rules
-    rows = _rows_touched(full, residuals)
-    top = max(rows, key=lambda row: _weight(full, residuals, row))
-    spans = [
-        windows(r[top], p.recording.time_s, p.recording.dt_s, rules, rules.window_over_noise * full.noise[top].sigma)
-        for p, r in zip(full.segments, residuals, strict=True)
-    ]
-    spans_s = _by_recording(full, spans)
-    where = condition(full, residuals, top, max(1, sum(p.n for p in full.segments) // 20000))
-    return Location(
-        subsystem, [full.model.outputs[row].channel for row in rows], spans_s, where, _share(full, fits, spans, top)
-    )
-
-
-def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
-    """`fit` simulated on the samples of `full`."""
-    for segment, coarse in zip(full.segments, like.segments, strict=True):
-        segment.start = coarse.start
-        if not fit.terms:
-            full.model.settle(segment, fit.values)
-        if segment.begin is not None and coarse.begin is not None:
-            segment.begin.values = coarse.begin.values
-    again = replace(fit)
-    again.residuals = [full.left(segment, fit.terms, fit.values) for segment in full.segments]
-    return again
-
-
-def _fits_at_full_rate(full: Problem, found: Found, coarse: Problem) -> FullRate:
-    """Both fits on the samples of `full`, whose segments then hold the equations, and the states of the best fit."""
-    nominal = at_full_rate(full, found.nominal, coarse)
-    for form in found.forms:
-        lay_out(full.segments, form)
-    return FullRate(nominal, at_full_rate(full, found.best, coarse))
-
-
-def _figures(full: Problem, fits: FullRate) -> Figures:
-    rows = range(len(full.noise))
-    before, after, white_b, white_a = (np.zeros(len(full.noise)) for _ in range(4))
-    nominal, best = fits.nominal, fits.best
-    for row in rows:
-        for store, fit in ((before, nominal), (after, best)):
-            store[row] = rms([r[row][p.heldout] for r, p in zip(fit.residuals, full.segments, strict=True)])
-        for store, fit in ((white_b, nominal), (white_a, best)):
-            masks, noise = [p.heldout for p in full.segments], full.noise[row]
-            # The colour of the noise is an estimate: a residual that is white itself must not fail for a wrong one.
-            coloured = whiteness([noise.whiten(r[row]) for r in fit.residuals], masks)
-            white = whiteness([r[row] / noise.sigma for r in fit.residuals], masks) if noise.sigma > 0.0 else 0.0
-            store[row] = max(coloured, white)
-    ratio = np.where(after > 0, before / np.maximum(after, 1e-300), 1.0)
-    used = np.isfinite(before) & (before > 0)
-    primary = int(np.argmax(np.where(used, ratio, 0.0)))
-    # The residual is noise and perhaps more: an estimate above it, of parts taken for rest, is too high.
-    left = np.array([rms([r[row] for r in best.residuals]) for row in rows])
-    noise_sd = np.fmin(full.noise_sd, np.where(left > 0.0, left, np.nan))
-    return Figures(before, after, noise_sd, white_b, white_a, primary)
-
-
-def rms(parts: list[Array]) -> float:
-    """Return the RMS of all finite samples of `parts`, NaN where there are none."""
-    together = np.concatenate(parts)
-    together = together[np.isfinite(together)]
-    return float(np.sqrt(np.mean(together**2))) if together.size else float("nan")
-
-
-def _locate(full: Problem, found: Found, fits: FullRate) -> list[Location]:
-    out: list[Location] = []
-    for subsystem in dict.fromkeys(term.candidate.port.subsystem for term in found.best.terms):
-        alone = _contribution(full, found, fits, subsystem)
-        rows = _rows_touched(full, alone)
-        if not rows:
-            continue
-        top = max(rows, key=lambda row: _weight(full, alone, row))
-        least = full.rules.window_output_share * _weight(full, alone, top)
-        strong = [row for row in rows if _weight(full, alone, row) >= least]
-        spans = [
-            joined([span for row in strong for span in _windows(segment, m[row], full.rules)], full.rules)
-            for segment, m in zip(full.segments, alone, strict=True)
-        ]
-        share = _share(full, fits, spans, top)
-        where = condition(full, alone, top, max(1, sum(p.n for p in full.segments) // 20000))
-        out.append(
-            Location(subsystem, [full.model.outputs[row].channel for row in rows], _by_recording(full, spans), where, share)
-        )
-    return out
-
-
-def _contribution(full: Problem, found: Found, fits: FullRate, subsystem: str) -> list[Array]:
-    """What the effects at `subsystem` add: best model against the best model with them at rest, nominal part refitted
-    for neither.
-    """
-    if len({term.candidate.port.subsystem for term in found.best.terms}) == 1:
-        return mismatch_of(fits.nominal, fits.best)
-    here = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.subsystem == subsystem)
-    terms, values = without(found.best, full, here)
-    out = []
-    for segment, r in zip(full.segments, fits.best.residuals, strict=True):
-        change = (segment.y - r) - full.simulate(segment, terms, values)
-        out.append(change - np.nanmean(change, axis=1, keepdims=True))
-    return out
-
-
-def _rows_touched(full: Problem, change: list[Array]) -> list[int]:
-    """Outputs in which the change is at least a third of the largest, in units of noise."""
-    weights = [_weight(full, change, row) for row in range(len(full.noise))]
-    least = max(weights) / full.rules.located_output_ratio
-    return [row for row, weight in enumerate(weights) if weight >= least and weight > 0.0]
-
-
-def _weight(full: Problem, change: list[Array], row: int) -> float:
-    return (
-        rms([c[row] for c in change]) / max(full.noise[row].sigma, 1e-300)
-        if any(np.isfinite(c[row]).any() for c in change)
-        else 0.0
-    )
-
-
-def _by_recording(full: Problem, spans: list[list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
-    """Windows of every recording by its name, in the time of its file."""
-    begins = [segment.recording.begin_s for segment in full.segments]
-    return {
-        segment.recording.name: [(a + begin, b + begin) for a, b in each]
-        for segment, each, begin in zip(full.segments, spans, begins, strict=True)
-    }
-
-
-def _windows(segment: Segment, change: Array, rules: SelectionRules) -> list[tuple[float, float]]:
-    return windows(change, segment.recording.time_s, segment.recording.dt_s, rules)
-
-
-def _share(full: Problem, fits: FullRate, spans: list[list[tuple[float, float]]], row: int) -> float:
-    """Part of the nominal model's residual energy above noise that falls into the windows."""
-    held = total = 0.0
-    for segment, r, span in zip(full.segments, fits.nominal.residuals, spans, strict=True):
-        good = np.isfinite(r[row])
-        above = np.where(good, r[row] ** 2 - full.noise[row].sigma ** 2, 0.0)
-        total += float(above.sum())
-        held += float(above[inside(span, segment.recording.time_s)].sum())
-    return float(np.clip(held / total, 0.0, 1.0)) if total > 0.0 else 0.0

@@ -14,9 +14,10 @@ from host.diagnosis.model.effect import Candidate, Parameter, alike_everywhere, 
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.models import channels_of
-from host.diagnosis.pipeline import Diagnosis, Location, rms
+from host.diagnosis.pipeline import Diagnosis
 from host.diagnosis.selection.equivalence import Standing, probability_of
-from host.diagnosis.selection.locate import joined
+from host.diagnosis.selection.full_rate import rms
+from host.diagnosis.selection.locate import Location, joined
 from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
 # Findings on what these data cannot decide, the most important one first.

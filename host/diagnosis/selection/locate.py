@@ -11,6 +11,9 @@ from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import fill, since_reversal
+from host.diagnosis.selection.found import Found
+from host.diagnosis.selection.full_rate import FullRate, rms
+from host.diagnosis.selection.screening import without
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -40,8 +43,8 @@ def windows(
     """Return the time spans in which the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`);
     short gaps are closed, short spans dropped.
     """
-    rms = moving_rms(fill(mismatch), dt_s)
-    high = rms > (rules.window_level * np.quantile(rms, rules.window_quantile) if level is None else level)
+    size = moving_rms(fill(mismatch), dt_s)
+    high = size > (rules.window_level * np.quantile(size, rules.window_quantile) if level is None else level)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], high.astype(np.int8), [0]))))
     spans = [[time_s[a], time_s[b - 1]] for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return joined([(float(a), float(b)) for a, b in spans], rules)
@@ -147,3 +150,107 @@ def _words(name: str, side: str, limit: float, problem: Problem) -> str:
         return f"{where} {limit:.3g} {unit} {'of' if side == 'below' else 'from'} {channel} reversals"
     unit = f"{unit}/s" if kind == "speed" else unit
     return f"{kind} of {channel} {side} {limit:.3g} {unit}".rstrip()
+
+
+@dataclass
+class Location:
+    """One subsystem with a mismatch: where and when."""
+
+    subsystem: str
+    channels: list[str]
+    windows_s: dict[str, list[tuple[float, float]]]  # of every recording, in its file's own time
+    condition: Condition | None
+    residual_share: float
+
+
+def locate(full: Problem, found: Found, fits: FullRate) -> list[Location]:
+    """Where, when and under which condition the effects that were found act, one location for each subsystem."""
+    out: list[Location] = []
+    for subsystem in dict.fromkeys(term.candidate.port.subsystem for term in found.best.terms):
+        alone = _contribution(full, found, fits, subsystem)
+        rows = _rows_touched(full, alone)
+        if not rows:
+            continue
+        top = max(rows, key=lambda row: _weight(full, alone, row))
+        least = full.rules.window_output_share * _weight(full, alone, top)
+        strong = [row for row in rows if _weight(full, alone, row) >= least]
+        spans = [
+            joined([span for row in strong for span in _windows_of(segment, m[row], full.rules)], full.rules)
+            for segment, m in zip(full.segments, alone, strict=True)
+        ]
+        share = _share(full, fits, spans, top)
+        where = condition(full, alone, top, max(1, sum(p.n for p in full.segments) // 20000))
+        out.append(
+            Location(subsystem, [full.model.outputs[row].channel for row in rows], _by_recording(full, spans), where, share)
+        )
+    return out
+
+
+def unexplained(full: Problem, fits: FullRate, subsystem: str) -> Location:
+    """Where the refitted nominal model fails, if no effect explains it."""
+    residuals, rules = fits.nominal.residuals, full.rules
+    rows = _rows_touched(full, residuals)
+    top = max(rows, key=lambda row: _weight(full, residuals, row))
+    spans = [
+        windows(r[top], p.recording.time_s, p.recording.dt_s, rules, rules.window_over_noise * full.noise[top].sigma)
+        for p, r in zip(full.segments, residuals, strict=True)
+    ]
+    spans_s = _by_recording(full, spans)
+    where = condition(full, residuals, top, max(1, sum(p.n for p in full.segments) // 20000))
+    return Location(
+        subsystem, [full.model.outputs[row].channel for row in rows], spans_s, where, _share(full, fits, spans, top)
+    )
+
+
+def _contribution(full: Problem, found: Found, fits: FullRate, subsystem: str) -> list[Array]:
+    """What the effects at `subsystem` add: best model against the best model with them at rest, nominal part refitted
+    for neither.
+    """
+    if len({term.candidate.port.subsystem for term in found.best.terms}) == 1:
+        return mismatch_of(fits.nominal, fits.best)
+    here = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.subsystem == subsystem)
+    terms, values = without(found.best, full, here)
+    out = []
+    for segment, r in zip(full.segments, fits.best.residuals, strict=True):
+        change = (segment.y - r) - full.simulate(segment, terms, values)
+        out.append(change - np.nanmean(change, axis=1, keepdims=True))
+    return out
+
+
+def _rows_touched(full: Problem, change: list[Array]) -> list[int]:
+    """Outputs in which the change is at least a third of the largest, in units of noise."""
+    weights = [_weight(full, change, row) for row in range(len(full.noise))]
+    least = max(weights) / full.rules.located_output_ratio
+    return [row for row, weight in enumerate(weights) if weight >= least and weight > 0.0]
+
+
+def _weight(full: Problem, change: list[Array], row: int) -> float:
+    return (
+        rms([c[row] for c in change]) / max(full.noise[row].sigma, 1e-300)
+        if any(np.isfinite(c[row]).any() for c in change)
+        else 0.0
+    )
+
+
+def _by_recording(full: Problem, spans: list[list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
+    """Windows of every recording by its name, in the time of its file."""
+    begins = [segment.recording.begin_s for segment in full.segments]
+    return {
+        segment.recording.name: [(a + begin, b + begin) for a, b in each]
+        for segment, each, begin in zip(full.segments, spans, begins, strict=True)
+    }
+
+
+def _windows_of(segment: Segment, change: Array, rules: SelectionRules) -> list[tuple[float, float]]:
+    return windows(change, segment.recording.time_s, segment.recording.dt_s, rules)
+
+
+def _share(full: Problem, fits: FullRate, spans: list[list[tuple[float, float]]], row: int) -> float:
+    """Part of the nominal model's residual energy above noise that falls into the windows."""
+    held = total = 0.0
+    for segment, r, span in zip(full.segments, fits.nominal.residuals, spans, strict=True):
+        good = np.isfinite(r[row])
+        above = np.where(good, r[row] ** 2 - full.noise[row].sigma ** 2, 0.0)
+        total += float(above.sum())
+        held += float(above[inside(span, segment.recording.time_s)].sum())
+    return float(np.clip(held / total, 0.0, 1.0)) if total > 0.0 else 0.0

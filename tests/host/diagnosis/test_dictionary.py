@@ -25,7 +25,7 @@ def fitted(case: tuple[Path, list[Path]]) -> tuple[Problem, Fit]:
 
 
 def places(problem: Problem, fit: Fit) -> list[PredictedPart]:
-    return predict_residual(problem, fit, np.array([noise.sigma for noise in problem.noise]))
+    return predict_residual(problem, fit)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])

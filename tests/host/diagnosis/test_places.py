@@ -58,12 +58,8 @@ def found_by(problem: Problem, nominal: Fit, *ids: str) -> Found:
     """What a search that knows only these effects finds."""
     candidate_effects = [c for c in candidates(problem.model.ports, True) if c.effect.id in ids]
     found = Found(nominal, nominal, [])
-    _grow(problem, found, candidate_effects, floor_of(problem), 0.0, silent)
+    _grow(problem, found, candidate_effects, 0.0, silent)
     return found
-
-
-def floor_of(problem: Problem) -> Array:
-    return np.array([noise.sigma for noise in problem.noise])
 
 
 def test_a_wrong_partner_is_exchanged_for_the_right_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,7 +68,7 @@ def test_a_wrong_partner_is_exchanged_for_the_right_one(tmp_path: Path, monkeypa
     problem, nominal = fitted(planted.transmission(tmp_path, "compliance", 1))
     found = found_by(problem, nominal, "compliance", "rate_lag")
     assert {name.partition("@")[0] for name in found.best.names} == {"compliance", "rate_lag"}
-    _exchange(problem, found, candidates(problem.model.ports, True), floor_of(problem), silent)
+    _exchange(problem, found, candidates(problem.model.ports, True), silent)
     assert {name.partition("@")[0] for name in found.best.names} == {"compliance", "backlash"}
 
 
@@ -90,5 +86,5 @@ def test_an_equation_that_does_better_is_listed_beside_a_stand_in(
     )
     begin = [*nominal.values, *(p.grid[0] for p in term.parameters)]
     best = finish(problem, minimize(problem, (term,), np.array(begin)))
-    (standing,) = standings(problem, Found(nominal, best, []), floor_of(problem))
+    (standing,) = standings(problem, Found(nominal, best, []))
     assert ("unlisted@cable" in [other.name for other in standing.alike]) is equal

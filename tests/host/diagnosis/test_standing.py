@@ -75,7 +75,7 @@ def test_evidence_that_one_recording_carries_is_named(shown_in: tuple[int, ...],
     noise = [1e-3 * rng.standard_normal((1, 600)) for _ in range(3)]
     removed = [np.sin(8.0 * t)[None, :] * (5e-3 if k in shown_in else 0.0) for k in range(3)]
     less = Fit((), np.zeros(0), [e + r for e, r in zip(noise, removed, strict=True)])
-    assert _rests_on(problem, less, Fit((), np.zeros(0), noise), np.array([1e-3]), 1) == rests_on
+    assert _rests_on(problem, less, Fit((), np.zeros(0), noise), 1) == rests_on
 
 
 @pytest.mark.parametrize(("value", "reached"), [(0.0, True), (0.5, False), (1.0, True)])
@@ -336,6 +336,6 @@ def test_an_improbable_effect_stays_if_no_other_is_probable_without_it(
     monkeypatch.setattr(equivalence, "standings", lambda *_: [strong])
     monkeypatch.setattr(equivalence, "remainder_of", lambda *_: Remainder(None, left))
     before = found.best
-    fewer = without_improbable(problem, found, [strong, weak], Remainder(None, 0.0), np.array([1e-2]))
+    fewer = without_improbable(problem, found, [strong, weak], Remainder(None, 0.0))
     assert (fewer is not None) is removed
     assert (found.best is before) is not removed
