@@ -38,7 +38,6 @@ from host.diagnosis.selection.early import early_outputs
 from host.diagnosis.selection.equivalence import (
     Standing,
     most_probable,
-    probability_of,
     standings,
     with_unlisted_rival,
     without_improbable,
@@ -130,7 +129,9 @@ def problems(
     full = _problem(model, recordings, columns, rules)
     if factor <= 1:
         return model, full, full
-    return model, _problem(model, [thin(r, factor) for r in recordings], columns, rules), full
+    thinned = _problem(model, [thin(r, factor) for r in recordings], columns, rules)
+    thinned.recorded_s = full.recorded_s
+    return model, thinned, full
 
 
 def thinning(model: Model, recordings: list[Recording]) -> int:
@@ -175,7 +176,8 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str],
         segment.resolution = np.array([readings.resolution(y, rules.data, switched=False) for y in segment.y]) / np.sqrt(
             12.0
         )
-    return Problem(model, segments, noises, np.ones(len(model.outputs)), columns, rules)
+    period_s = recordings[0].dt_s if recordings[0].timed else 0.0
+    return Problem(model, segments, noises, np.ones(len(model.outputs)), columns, rules, recorded_s=period_s)
 
 
 def diagnose(
@@ -239,9 +241,7 @@ def _diagnosed(
         standing = standings(problem, found)
     while fewer := without_improbable(problem, found, standing, remainder):
         standing, remainder = fewer
-    probable = max((probability_of(one, remainder.share, problem.rules).effect for one in standing), default=0.0)
-    same = found.best if probable >= problem.rules.further_probability else found.nominal
-    between = [] if budget.spent() else _parameters_differ(full, problem, found.nominal, same)
+    between = [] if budget.spent() else _parameters_differ(full, problem, found)
     if between and found.best.terms:
         found.best, standing = fit_nominal(problem), []
     standing = with_unlisted_rival(standing, remainder)
@@ -287,12 +287,9 @@ def _diagnosed(
     return result
 
 
-def _parameters_differ(full: Problem, problem: Problem, nominal: Fit, same: Fit) -> list[Finding]:
-    """What shows that the recordings, or two parts of one, have different nominal parameters.
-
-    same: the best model that has the same parameters throughout.
-    """
-    rival = inadequate(problem, same)
+def _parameters_differ(full: Problem, problem: Problem, found: Found) -> list[Finding]:
+    """What shows that the recordings, or two parts of one, have different nominal parameters."""
+    nominal, rival = found.nominal, inadequate(problem, found.best)
     if rival is None:
         return []
     whole = [segment.recording for segment in full.segments]

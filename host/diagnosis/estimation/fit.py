@@ -84,6 +84,7 @@ class Problem:
     noise_passed: float = 0.0  # share of the residual's variance that is noise of measured inputs, through the nominal law
     waits_s: float = 0.0  # time from the first sample on that is left out at least, while a dead time is fitted
     ends_s: float = 0.0  # and before the last one, while the drift of a clock is
+    recorded_s: float = 0.0  # period of the samples as recorded, of which several may be averaged into one; 0: untimed
 
     @property
     def apart(self) -> bool:

@@ -28,6 +28,9 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     McCaffrey 2002). A module whose formula is not quite the true one errs alike all through one excitation and otherwise
     in the next. Sums of scores over halves of recordings, held-out ones too, show that: where these scatter more than
     chance would, the interval is made of them.
+
+    At which moment of a sample an input acts and an output is read, a recording does not say: the two may be up to
+    `sampling_delay` samples apart. Delays and time constants of effects are uncertain by that as well (uniform).
     """
     parameters = problem.parameters(fit.terms)
     if not free(parameters):
@@ -56,6 +59,9 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
         p, value, half = parameters[index], float(fit.values[index]), float(widths[place])
         if p.event:  # between two samples nothing shows it
             half = max(half, 0.5 * problem.segments[0].recording.dt_s / sizes[index])
+        if p.unit == "s" and not (p.event or p.linear) and index >= len(problem.model.parameters):
+            apart_s = problem.rules.sampling_delay * problem.recorded_s / np.sqrt(3.0)
+            half = float(np.hypot(half, quantile * apart_s / (value if p.log else sizes[index])))
         if p.log:
             half = min(half, 20.0)
             low, high = value * np.exp(-half), value * np.exp(half)
