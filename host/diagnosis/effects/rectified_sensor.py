@@ -8,8 +8,8 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Share of the sign that is lost (1: all of it)."""
-    return (Parameter("share", "", (1.0,), 0.0, 1.0, step=0.3),)
+    """Share of the sign that is lost (1: all of it). Below a half it is a difference of gain (`asymmetry`)."""
+    return (Parameter("share", "", (1.0,), 0.5, 1.0, step=0.3),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

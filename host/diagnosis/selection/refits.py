@@ -6,7 +6,17 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.feedback import find_feedback
-from host.diagnosis.estimation.fit import Fit, Problem, finish, first_needs, get_starts, minimize, reweigh, set_starts
+from host.diagnosis.estimation.fit import (
+    RAN_AWAY,
+    Fit,
+    Problem,
+    finish,
+    first_needs,
+    get_starts,
+    minimize,
+    reweigh,
+    set_starts,
+)
 from host.diagnosis.estimation.initial_state import STATE_STEPS, begun_again, fit_with_states, start_again
 from host.diagnosis.estimation.instants import placed
 from host.diagnosis.model.effect import Candidate, rate_key
@@ -23,7 +33,7 @@ def fit_nominal(problem: Problem) -> Fit:
     A model that takes a measured output as an input too (`settle`) has it freed of noise before each fit, with what it
     simulates itself: errors in a variable that the fit takes for exact would bend its parameters.
     """
-    fit = Fit((), problem.model.guess(problem.segments))
+    fit = Fit((), _first_values(problem))
     for _ in range(3):
         settle(problem, fit.values)
         reweigh(problem, fit)
@@ -33,6 +43,30 @@ def fit_nominal(problem: Problem) -> Fit:
     problem.noise_fed = fed and _at_noise(problem, fit)
     problem.noise_passed = _of_inputs(problem, fit)
     return fit
+
+
+def _first_values(problem: Problem) -> Array:
+    """Nominal values to fit from: the model's guess, or the best of its restarts where the guess leaves more than no motion
+    at all would.
+
+    The guess is linear. Where noise or drop-outs make a mass negative there, its default takes its place, and the simulation
+    may run away.
+    """
+    model, guess = problem.model, problem.model.guess(problem.segments)
+    fitted = [segment for segment in problem.segments if segment.fit.any()]
+
+    def left(values: Array) -> float:
+        total = 0.0
+        for segment in fitted:
+            r = np.clip(problem.left(segment, (), values)[:, segment.fit], -RAN_AWAY, RAN_AWAY)
+            spread = np.nanvar(segment.y[:, segment.fit], axis=1, keepdims=True)
+            total += float(np.nansum(r**2 / np.maximum(spread, 1e-300)))
+        return total
+
+    samples = sum(int(np.isfinite(segment.y[:, segment.fit]).sum()) for segment in fitted)
+    if left(guess) <= samples:
+        return guess
+    return min([guess, *model.restarts(fitted)], key=left)
 
 
 def settled(problem: Problem, fit: Fit) -> Fit:

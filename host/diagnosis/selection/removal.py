@@ -103,12 +103,21 @@ def drop_unsure(problem: Problem, found: Found) -> None:
 
 
 def unsure(problem: Problem, fit: Fit) -> list[Term]:
-    """Terms of one amplitude whose interval contains zero."""
-    amplitudes = [term for term in fit.terms if len(term.parameters) == 1 and term.parameters[0].linear]
-    if not amplitudes:
+    """Terms whose amplitude these recordings do not determine: the interval of an effect of one parameter contains zero, or
+    that of the only amplitude reaches both of its bounds.
+
+    The latter is an effect that does what the nominal parameters do, such as a gain that changes where the motion ends.
+    """
+    amplitudes = [(term, [k for k, p in enumerate(term.parameters) if p.linear]) for term in fit.terms]
+    single = [(term, places[0]) for term, places in amplitudes if len(places) == 1]
+    if not single:
         return []
-    spans = intervals(problem, fit)
-    return [term for term in amplitudes if spans[fit.first_of(term)][0] <= 0.0 <= spans[fit.first_of(term)][1]]
+    spans, found = intervals(problem, fit), []
+    for term, place in single:
+        (low, high), p = spans[fit.first_of(term) + place], term.parameters[place]
+        if (low <= 0.0 <= high and len(term.parameters) == 1) or (low <= p.low and p.high <= high):
+            found.append(term)
+    return found
 
 
 def drop_unsure_events(problem: Problem, found: Found, candidate_effects: list[Candidate]) -> None:
