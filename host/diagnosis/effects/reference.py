@@ -32,6 +32,7 @@ def traits(effects: list[Effect]) -> str:
         ("needs a rate", any(e.timed for e in effects)),
         ("commutes", any(e.invariant for e in effects)),
         ("natural bounds", any(e.natural_bounds for e in effects)),
+        ("wider than the vocabulary", any(e.extended for e in effects)),
         ("seen at rest", any(e.at_rest for e in effects)),
         ("named " + " or ".join(dict.fromkeys(i for e in effects for i in e.spans)), any(e.spans for e in effects)),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
@@ -41,6 +43,12 @@ _LINEAR = Effect(
     timed=True,
     dissipates=True,
 )
+_QUADRATIC = in_form(
+    _LINEAR,
+    "quadratic",
+    "A drag of {coefficient} times the square of the speed acts against the motion.",
+    "F = coefficient*v*|v|",
+)
 EFFECTS = (
     Effect(
         "viscous_friction",
@@ -55,10 +63,5 @@ EFFECTS = (
         invariant=True,
     ),
     _LINEAR,
-    in_form(
-        _LINEAR,
-        "quadratic",
-        "A drag of {coefficient} times the square of the speed acts against the motion.",
-        "F = coefficient*v*|v|",
-    ),
+    replace(_QUADRATIC, extended=True),
 )

@@ -158,6 +158,7 @@ class Effect:
     corner: Corner | None = None  # of a form that spans several ids: the id that values stand for, and what it then says
     spans: tuple[str, ...] = ()  # those ids
     listed: bool = True  # of the vocabulary
+    extended: bool = False  # the vocabulary's effect is a narrower law: an equation outside it would say the same
     searched: bool = False  # an equation of recorded signals: it says nothing of a motion that was not recorded
     dissipates: bool = False  # its linear parameters are friction: none is negative, whichever way an output counts
     family: str = ""  # of one family only one acts at a port: the second takes the place of the first

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
@@ -21,8 +20,6 @@ from host.diagnosis.selection.screening import replaced_by, term_of, without
 from host.diagnosis.selection.trial import Trial, at_bound, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -58,6 +55,8 @@ def standings(problem: Problem, found: Found) -> list[Standing]:
         alike += tuple(dict.fromkeys(part for part, _ in paired if part not in alike))
         least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said, *paired))
+        if term.candidate.effect.extended and not any(other.effect.searched for other in alike):
+            alike += (_as_equation(term.candidate),)
         alone = _rests_on(problem, less, found.best, term.fitted)
         # No inexact formula of another effect leaves a line that no motion has.
         doubtful = less.terms and not term.candidate.effect.memories
@@ -211,6 +210,11 @@ def _rests_on(problem: Problem, less: Fit, best: Fit, parameters: int) -> str:
         gains.append((gain, segment.recording.name))
     gain, name = min(gains)
     return name if gain < needed else ""
+
+
+def _as_equation(candidate: Candidate) -> Candidate:
+    """The same law under the name of an equation: the vocabulary's effect of this id is a narrower one."""
+    return replace(candidate, effect=replace(candidate.effect, id="unlisted", listed=False, searched=True, extended=False))
 
 
 def with_unlisted_rival(standing: list[Standing], remainder: Remainder) -> list[Standing]:

@@ -49,6 +49,7 @@ def test_drag_of_the_square_of_the_speed() -> None:
     """Its first step was ten times too long, as that of an acceleration: an equation was named (0.18)."""
     (found,) = sd.diagnose(drives(lambda v: 1.2 * v * abs(v), -500.0), VEHICLE).effects
     assert found["id"] == "viscous_friction" and found["probability"] > 0.5
+    assert [name.partition("@")[0] for name in found["indistinguishable_from"]] == ["unlisted"]
     assert found["parameters"]["coefficient_N_s2_per_m2"]["value"] == pytest.approx(1.2, rel=0.05)
 
 

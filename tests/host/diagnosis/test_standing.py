@@ -145,9 +145,8 @@ def test_an_equation_chosen_among_hundreds_is_no_simpler_than_an_effect(monkeypa
     found.fit = Fit((Term(equation, equation.effect.parameters(scale, "")),), np.zeros(1))
     ahead = Gain(6.0, 1e-3, 0.1, independent=np.array([60.0]))
     monkeypatch.setattr(equivalence, "equations_for", lambda *_: [found])
-    monkeypatch.setattr(equivalence, "compare", lambda *_: ahead)
-    problem: Any = SimpleNamespace(rules=RULES, segments=[])
-    ((rival, difference),) = equivalence._better_said(problem, Found(best, best, []), limit, best, WHOLE, np.ones(1))
+    problem: Any = SimpleNamespace(rules=RULES, segments=[], gain=lambda *_: ahead)
+    ((rival, difference),) = equivalence._better_said(problem, Found(best, best, []), limit, best, WHOLE)
     assert rival is equation and difference == pytest.approx(-6.0 * RULES.coarsening / (60.0 + RULES.coarsening))
 
 
@@ -221,7 +220,7 @@ def test_further_forms_do_not_fill_the_places_of_other_effects() -> None:
 
 
 @pytest.mark.parametrize(("lead", "named"), [(0.5, True), (30.0, False)])
-def test_a_pair_that_does_as_well_shares_the_probability(lead: float, named: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pair_that_does_as_well_shares_the_probability(lead: float, named: bool) -> None:
     """A loop with a dead band is as late as a delay and rests like a gap: data may not separate them."""
     loop, gap, late = (
         next(c for c in candidates((PORT,), True) if (c.effect.id, c.form) == key)
@@ -233,9 +232,8 @@ def test_a_pair_that_does_as_well_shares_the_probability(lead: float, named: boo
         for given in ((loop,), (gap, late))
     )
     ahead = Gain(lead, 0.2, 0.01, independent=np.array([60.0]))
-    monkeypatch.setattr(equivalence, "compare", lambda *_: ahead)
-    problem: Any = SimpleNamespace(rules=RULES, segments=[])
-    parts = equivalence._pairs(problem, Found(best, best, [], pairs=[pair]), loop, WHOLE, np.ones(1))
+    problem: Any = SimpleNamespace(rules=RULES, segments=[], gain=lambda *_: ahead)
+    parts = equivalence._pairs(problem, Found(best, best, [], pairs=[pair]), loop, WHOLE)
     assert [part for part, _ in parts] == ([gap, late] if named else [])
     if named:
         gain = Gain(400.0, 1e-9, 0.9, independent=np.array([400.0]), log_ratio=np.array([2.0]), excesses=np.array([0.1]))
