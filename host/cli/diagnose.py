@@ -184,8 +184,7 @@ def summary(verdict: dict[str, Any]) -> list[str]:
     lines += [f"worse: {text}" for text in verdict["worse"]]
     if fit["rmse_before"] is None:
         return [*lines, f"next: {verdict['next']}"]
-    lines.append(
-        f"held-out RMS error {fit['rmse_before']:.4g} {fit['unit']}, with the effects {fit['rmse_after']:.4g} "
-        f"{fit['unit']}; noise {fit['noise_floor']:.4g} {fit['unit']}"
-    )
+    after = f", with the effects {fit['rmse_after']:.4g} {fit['unit']}" if verdict["effects"] else ""
+    noise = f"; noise {fit['noise_floor']:.4g} {fit['unit']}"
+    lines.append(f"held-out RMS error {fit['rmse_before']:.4g} {fit['unit']}{after}{noise}")
     return [*lines, f"next: {verdict['next']}"]

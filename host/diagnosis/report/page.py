@@ -15,6 +15,10 @@ from host.diagnosis.report.verdict import at_bound, likelier, remaining_power, r
 
 TEMPLATES = Path(__file__).parents[2] / "report" / "templates"
 NBSP = "\u00a0"
+PARAMETERS_DIFFER = {  # finding -> headline
+    "changed": "The nominal parameters change within a recording",
+    "session": "The nominal parameters differ between the recordings",
+}
 
 
 class Line(NamedTuple):
@@ -106,12 +110,14 @@ def headline(verdict: dict[str, Any]) -> str:
     """Return the verdict in one sentence."""
     names = [f"{words(e['id'])} ({words(e['subsystem'])})" for e in verdict["effects"]]
     data = list(dict.fromkeys(finding["id"] for finding in verdict["data_findings"]))
+    parameters = next((said for key, said in PARAMETERS_DIFFER.items() if key in data), "")
+    data = [key for key in data if not parameters or key not in PARAMETERS_DIFFER]
     also = f"; data: {', '.join(data)}" if data else ""
     also += f"; {worse_words(verdict)}" if verdict["worse"] else ""
     if verdict["verdict"] == "nothing_missing":
         return "Nothing is missing: the nominal model explains these recordings" + also
     if verdict["verdict"] == "mismatch_not_identified":
-        return "There is a mismatch, and no known effect explains it" + also
+        return (parameters or "There is a mismatch, and no known effect explains it") + also
     return "Missing: " + (names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]) + also
 
 
