@@ -51,8 +51,6 @@ SLOTS = (
     "drive_limit",
     "smooth",
     "smooth_speed",
-    "smooth_excess",
-    "smooth_stribeck",
     "constant",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
@@ -98,8 +96,6 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     DRIVE_LIMIT,
     SMOOTH,
     SMOOTH_SPEED,
-    SMOOTH_EXCESS,
-    SMOOTH_STRIBECK,
     CONSTANT,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
@@ -134,17 +130,9 @@ def level_at(v: float, p: Array) -> float:
 
 
 @njit(cache=True)
-def _smooth_level(v: float, p: Array) -> float:
-    """Level at speed v of friction that rises with speed from zero, and that may fall again to its kinetic value."""
-    if p[SMOOTH_STRIBECK] <= 0.0:
-        return p[SMOOTH]
-    return p[SMOOTH] + p[SMOOTH_EXCESS] * math.exp(-((v / p[SMOOTH_STRIBECK]) ** 2))
-
-
-@njit(cache=True)
 def _rising(v: float, p: Array) -> float:
     """Friction at speed v of the law that rises with speed; nothing where there is none."""
-    return _smooth_level(v, p) * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
+    return p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -172,17 +160,6 @@ def _slowed(v_free: float, lost: float, rise: float) -> float:
         if abs(step) <= 1e-9 * (abs(v) + rise):
             break
         v = v - step if low < v - step < high else 0.5 * (low + high)
-    return v
-
-
-@njit(cache=True)
-def _slowed_by(v_free: float, h_per_mass: float, p: Array) -> float:
-    """Speed after the impulse of friction that rises with speed; its level is that of the speed halfway."""
-    if p[SMOOTH_SPEED] <= 0.0:
-        return v_free
-    v = _slowed(v_free, h_per_mass * _smooth_level(v_free, p), p[SMOOTH_SPEED])
-    if p[SMOOTH_STRIBECK] > 0.0:
-        v = _slowed(v_free, h_per_mass * _smooth_level(0.5 * (v_free + v), p), p[SMOOTH_SPEED])
     return v
 
 
@@ -461,7 +438,7 @@ def run_axis(
                 else (u[i, j, 0] + more, u[i, j, 1] + more, u[i, j, 2] + more)
             )
             # Half the impulse of friction that rises with speed before the step, half after it (Strang 1968).
-            s = (s[0], _slowed_by(s[1], 0.5 * h / m, p), s[2], s[3])
+            s = (s[0], _slowed(s[1], 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED]), s[2], s[3])
             x_old, v_old = s[0], s[1]
             dry = level_at(v_old, p) if p[STRIBECK_D] <= 0.0 else 0.0
             if short:
@@ -475,7 +452,7 @@ def run_axis(
             if dry > 0.0:
                 v, further, stuck = _dry(v_old, v, a, dry, h, m)
                 x = x_old if stuck else x + further
-            v = _slowed_by(v, 0.5 * h / m, p)
+            v = _slowed(v, 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED])
             s = (x, v, x2, v2)
             slow = x + (slow - x) * decay
             if remembers:

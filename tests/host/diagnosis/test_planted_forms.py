@@ -249,14 +249,3 @@ def test_friction_depends_on_a_force_that_the_nominal_model_does_not_call_a_load
     assert effect["id"] == "load_dependent_friction"
     # 0.0485 with the interval 0.0470 to 0.04995, which misses 0.05: the smoothed speed gives less friction at reversals.
     assert effect["parameters"]["coefficient"]["value"] == pytest.approx(0.05, rel=0.05)
-
-
-def test_friction_that_rises_with_speed_and_falls_again() -> None:
-    def rubbing(t: Array, x: Array, normal: Array) -> Array:
-        v = np.gradient(x, 1e-3)
-        return (0.3 + 0.5 / (1.0 + (v / 2e-3) ** 2)) * v / np.sqrt(v**2 + 3e-4**2)
-
-    verdict = diagnose([pressed(seed, 6.0, rubbing) for seed in (1, 2, 3)], PRESSED).as_dict()
-    assert [effect["id"] for effect in verdict["effects"]] == ["stribeck_friction"]
-    assert "tanh" in verdict["effects"][0]["equation"]
-    assert verdict["fit"]["rmse_after"] < 0.1 * verdict["fit"]["rmse_before"]
