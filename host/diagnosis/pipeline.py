@@ -127,11 +127,7 @@ def problems(
     factor = thinning(model, recordings)
     columns = {name: channel.column for name, channel in channels_of(spec)[0].items()}
     full = _problem(model, recordings, columns, rules)
-    if factor <= 1:
-        return model, full, full
-    thinned = _problem(model, [thin(r, factor) for r in recordings], columns, rules)
-    thinned.recorded_s = full.recorded_s
-    return model, thinned, full
+    return model, full if factor <= 1 else _problem(model, recordings, columns, rules, factor), full
 
 
 def thinning(model: Model, recordings: list[Recording]) -> int:
@@ -143,8 +139,11 @@ def thinning(model: Model, recordings: list[Recording]) -> int:
     return factor
 
 
-def _problem(model: Model, recordings: list[Recording], columns: dict[str, str], rules: SelectionRules) -> Problem:
-    segments = [model.prepare(r) for r in recordings]
+def _problem(
+    model: Model, recordings: list[Recording], columns: dict[str, str], rules: SelectionRules, factor: int = 1
+) -> Problem:
+    """The problem of recordings of which `factor` samples are averaged into one."""
+    segments = [model.prepare(thin(r, factor)) for r in recordings]
     still = [
         noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed, rules)
         for p in segments
@@ -296,7 +295,7 @@ def _parameters_differ(full: Problem, problem: Problem, found: Found) -> list[Fi
     factor = thinning(problem.model, whole) if full is not problem else 1
 
     def prepared(recordings: list[Recording]) -> Problem:
-        return _problem(problem.model, [thin(r, factor) for r in recordings], problem.columns, problem.rules)
+        return _problem(problem.model, recordings, problem.columns, problem.rules, factor)
 
     return unlike_recordings(problem, nominal, rival) or changed_within(problem, nominal, rival, whole, prepared)
 

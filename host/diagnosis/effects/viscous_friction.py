@@ -43,12 +43,6 @@ _LINEAR = Effect(
     timed=True,
     dissipates=True,
 )
-_QUADRATIC = in_form(
-    _LINEAR,
-    "quadratic",
-    "A drag of {coefficient} times the square of the speed acts against the motion.",
-    "F = coefficient*v*|v|",
-)
 EFFECTS = (
     Effect(
         "viscous_friction",
@@ -63,5 +57,13 @@ EFFECTS = (
         invariant=True,
     ),
     _LINEAR,
-    replace(_QUADRATIC, extended=True),
+    replace(
+        in_form(
+            _LINEAR,
+            "quadratic",
+            "A drag of {coefficient} times the square of the speed acts against the motion.",
+            "F = coefficient*v*|v|",
+        ),
+        extended=True,
+    ),
 )

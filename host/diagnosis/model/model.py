@@ -159,7 +159,7 @@ class Model(ABC):
         return ()
 
     def restarts(self, segments: list[Segment]) -> list[Array]:
-        """Further start values of the nominal parameters, for effects that hide them."""
+        """Further start values of the nominal parameters: for effects that hide them, and where the guess fails."""
         return []
 
     def noise_of(self, segment: Segment) -> Any:

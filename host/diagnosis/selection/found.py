@@ -24,7 +24,7 @@ class SearchMove(Enum):
     REFIT = "the model before it was fitted again from the nominal parameters found with it"
     STOP = "no effect earned its place"
     BACKWARD = "removed again"
-    UNSURE = "removed: its interval contains zero"
+    UNSURE = "removed: its interval contains zero or all values"
     IMPROBABLE = "removed: it is improbable next to the others"
 
     @property

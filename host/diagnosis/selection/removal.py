@@ -91,7 +91,7 @@ def _simpler(found: Found, term: Term) -> list[Trial]:
 
 
 def drop_unsure(problem: Problem, found: Found) -> None:
-    """Drops effects of one amplitude whose interval contains zero.
+    """Drops effects whose only amplitude these recordings do not determine (`unsure`).
 
     The evidence counts independent samples. Where an effect was called for in some parts of the recordings only, or by a
     few, the jackknife of its interval shows that they do not agree on it.
