@@ -33,6 +33,7 @@ from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
 from host.diagnosis.selection.between_recordings import inadequate, unlike_recordings
+from host.diagnosis.selection.corners import over_alike
 from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
 from host.diagnosis.selection.early import early_outputs
 from host.diagnosis.selection.equivalence import (
@@ -245,7 +246,8 @@ def _diagnosed(
         found.best, standing = fit_nominal(problem), []
     standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
-    spans = intervals(problem, found.best)
+    alike = [intervals(problem, fit) for fit in found.alike]
+    spans = over_alike(problem, found, intervals(problem, found.best), alike)
     fits = fits_at_full_rate(full, found, problem)
     located, figures = locate(full, found, fits), figures_of(full, fits)
     result = Diagnosis(spec, model, problem, full, found, fits, standing, spans, located, figures)

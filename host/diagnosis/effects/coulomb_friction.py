@@ -25,11 +25,15 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     if form == "":
         return (level,)
     if form == "smooth":
-        speeds = spread(0.02 * s.speed, 0.5 * s.speed, 3)
-        unit = f"{s.motion_unit}/s"
-        return (level, Parameter("speed", unit, speeds, 2e-3 * s.speed, s.speed, log=True, vanishes=True))
+        return (level, rising(s))
     low, high = 1e-5 * s.motion_span, BRISTLES * s.motion_span
     return (level, Parameter("distance", s.motion_unit, spread(3.0 * low, 0.6 * high, 3), low, high, log=True))
+
+
+def rising(s: Scale) -> Parameter:
+    """Speed below which friction grows with speed."""
+    tried = spread(0.02 * s.speed, 0.5 * s.speed, 3)
+    return Parameter("speed", f"{s.motion_unit}/s", tried, 2e-3 * s.speed, s.speed, log=True, vanishes=True)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -107,5 +111,5 @@ EFFECTS = (
         "A constant force of {force} acts against the motion; it builds up within {distance}, far below the travel.",
         "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
     ),
-    replace(_RISING, timed=True, remembers=False),
+    replace(_RISING, timed=True, remembers=False, rounded=True),
 )

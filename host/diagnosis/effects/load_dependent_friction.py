@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from host.diagnosis.effects.coulomb_friction import held
+from host.diagnosis.effects.coulomb_friction import held, rising
 from host.diagnosis.effects.presliding_friction import build_up, yielding
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 from host.diagnosis.model.operators import capstan, dahl, pressed
 
 
@@ -21,12 +21,10 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Friction per load, and the distance of its build-up."""
+    """Friction per load, and the distance of its build-up; second form: the speed below which it grows with speed."""
     unit = "" if s.unit == s.source_unit else f"{s.unit}/{s.source_unit}"
-    return (
-        Parameter("coefficient", unit, (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-        replace(yielding(s, form, 5), vanishes=True),
-    )
+    coefficient = Parameter("coefficient", unit, (s.need / s.source_rms,), 0.0, np.inf, linear=True)
+    return coefficient, rising(s) if form == "smooth" else replace(yielding(s, form, 5), vanishes=True)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -56,7 +54,9 @@ def apply_in_mechanism(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Coefficient and distance of the hysteretic force that follows the load."""
+    """Coefficient of the force that follows the load, and the distance or the speed over which it builds up."""
+    if form == "smooth":
+        return {"load_smooth": p[0], "load_smooth_speed": p[1]}
     return {"load_friction": p[0], "load_friction_distance": p[1]}
 
 
@@ -72,6 +72,24 @@ _CAPSTAN = Effect(
     family="dry",
     remembers=True,
     dissipates=True,
+)
+_FORCE = Effect(
+    "load_dependent_friction",
+    "force",
+    12,
+    force,
+    "Friction grows with {source}: it is {coefficient} of its magnitude and builds up over {distance}.",
+    "F = coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance",
+    slots=slots,
+    source="drag",
+    remembers=True,
+    dissipates=True,
+)
+_RISING = in_form(
+    _FORCE,
+    "smooth",
+    "Friction grows with {source}: it is {coefficient} of its magnitude; below a speed of about {speed} it is smaller.",
+    "F = coefficient*|load|*tanh(v/speed)",
 )
 EFFECTS = (
     _CAPSTAN,
@@ -103,16 +121,6 @@ EFFECTS = (
         remembers=True,
         dissipates=True,
     ),
-    Effect(
-        "load_dependent_friction",
-        "force",
-        12,
-        force,
-        "Friction grows with {source}: it is {coefficient} of its magnitude and builds up over {distance}.",
-        "F = coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance",
-        slots=slots,
-        source="drag",
-        remembers=True,
-        dissipates=True,
-    ),
+    _FORCE,
+    replace(_RISING, timed=True, remembers=False, rounded=True),
 )

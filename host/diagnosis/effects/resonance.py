@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from host.diagnosis.model.effect import FORCES, Array, Context, Effect, Parameter, Scale, in_form, spread
-from host.diagnosis.model.operators import second_order
+from host.diagnosis.model.operators import followed, second_order
 
 DRIVES = (*FORCES, "V", "A", "mA")  # units of what drives a mass
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Frequency and damping ratio; form `share`: of a mode that takes part in only a share of the motion; form `drive`:
-    of a load behind a compliant shaft, read at the drive that a force or torque moves.
+    """Frequency and damping ratio; form `shaft`: of a load behind a compliant shaft, with a damper parallel to its spring;
+    form `share`: of a mode that takes part in only a share of the motion; form `drive`: of a load behind a compliant shaft,
+    read at the drive that a force or torque moves.
     """
     if form == "drive" and s.unit not in DRIVES:
         return ()  # a motion that is imposed does not feel the load
@@ -53,11 +54,16 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Second-order low pass with a peak, of all of the motion or of a share; or the reaction of a load on its drive."""
+    """Second-order low pass with a peak, of all of the motion or of a share; the motion of a load behind a shaft, or its
+    reaction on the drive.
+    """
     if not form:
         return of_mode(signal, c, p[0], p[1], c.start, c.start_rate)
+    if form == "shaft":
+        return of_shaft(signal, c, p[0], p[1], c.start, c.start_rate)
     part = -p[0] if form == "drive" else p[0]  # of the mode in the signal, from which its start is read
-    moved = of_mode(signal, c, p[1], p[2], *(s / part if abs(part) > 1e-3 else 0.0 for s in (c.start, c.start_rate)))
+    start, rate = (s / part if abs(part) > 1e-3 else 0.0 for s in (c.start, c.start_rate))
+    moved = of_mode(signal, c, p[1], p[2], start, rate)
     if form == "drive":
         turned = moved + p[2] / (np.pi * p[1]) * np.gradient(moved, c.dt_s)  # the damper turns the load as well
         return np.asarray(signal + p[0] * (signal - turned))
@@ -68,6 +74,12 @@ def of_mode(signal: Array, c: Context, frequency_Hz: float, damping_ratio: float
     """Motion behind a mode of unit gain."""
     omega = 2.0 * np.pi * frequency_Hz
     return second_order(signal, c.dt_s, 2.0 * damping_ratio / omega, 1.0 / omega**2, start, rate)
+
+
+def of_shaft(signal: Array, c: Context, frequency_Hz: float, damping_ratio: float, start: float, rate: float) -> Array:
+    """Motion of a load that a spring and a damper move together."""
+    omega = 2.0 * np.pi * frequency_Hz
+    return followed(signal, c.dt_s, 2.0 * damping_ratio / omega, 1.0 / omega**2, start, rate)
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
@@ -109,6 +121,12 @@ EFFECTS = (
         for whole in _WHOLE
         for each in (
             whole,
+            in_form(
+                whole,
+                "shaft",
+                "A load turns on a spring and a damper; it oscillates at {frequency}, damping ratio {damping_ratio}.",
+                f"{_MODE},  y = m + 2 z/w m'",
+            ),
             in_form(
                 whole,
                 "share",

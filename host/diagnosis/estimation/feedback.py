@@ -84,23 +84,30 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
         segment.fed_back = [None] * segment.y.shape[0]
     for row in range(segments[0].y.shape[0]):
         later, earlier = _share(after, residuals, row), _share(before, residuals, row)
-        if later >= max(rules.feedback_share, rules.feedback_over_past * earlier):
+        fed = later >= max(rules.feedback_share, rules.feedback_over_past * earlier)
+        if fed:
             for segment, basis in zip(segments, handed_on, strict=True):
                 segment.fed_back[row] = basis
         if around:
             noisy = noisy or _share(around, residuals, row) > rules.feedback_predicted_share
             for segment, basis in zip(segments, around, strict=True):
                 segment.fed_back[row] = basis
-        at_once = [_at_once(segments, residuals, row, name, earlier, rules) for name in inputs]
+        # A controller that is late by less than a sample sends noise into the same row as well, if less of it.
+        least = None if fed else max(rules.feedback_share, rules.feedback_over_past * earlier)
+        at_once = [_at_once(segments, residuals, row, name, least, rules) for name in inputs]
         for index, column in itertools.chain.from_iterable(at_once):
             segments[index].fed_back[row] = _with(segments[index].fed_back[row], column)
     return noisy
 
 
 def _at_once(
-    segments: list[Segment], residuals: list[Array], row: int, name: str, earlier: float, rules: SelectionRules
+    segments: list[Segment], residuals: list[Array], row: int, name: str, least: float | None, rules: SelectionRules
 ) -> list[tuple[int, Array]]:
-    """New part of input `name` of each segment, by its index, if noise of this output is in it; else none."""
+    """New part of input `name` of each segment, by its index, if noise of this output is in it; else none.
+
+    least: share of the residual's variance that it has to say, and more than the other part of the input does; None where
+    later input shows that there is feedback.
+    """
     parts = []
     for index, (segment, residual) in enumerate(zip(segments, residuals, strict=True)):
         x = segment.inputs.get(name)
@@ -118,10 +125,8 @@ def _at_once(
     if power == 0.0 or size == 0.0:
         return []
     by_new, by_rest = np.linalg.lstsq(np.column_stack((new, rest)), r, rcond=1e-12)[0]
-    share = by_new**2 * size / power
-    if share < rules.feedback_share or share < rules.feedback_over_past * earlier:
-        return []
-    if abs(by_new) < rules.feedback_over_remainder * abs(by_rest):
+    plain = abs(by_new) >= rules.feedback_over_remainder * abs(by_rest)
+    if least is not None and not (plain and by_new**2 * size / power >= least):
         return []
     return [(index, part) for index, part, _, _ in parts if np.any(part)]
 

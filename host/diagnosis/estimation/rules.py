@@ -144,6 +144,7 @@ class SelectionRules:
     crossed_folds: int = 4  # groups of recordings that are predicted from the others, at most
     crossed_fits: int = 4  # best candidates that are cross-validated where the recordings held out show nothing of them
     split_fits: int = 6  # pairs that are fitted in the place of one effect that joins two kinds
+    joint_over_noise: float = 1.3  # residual over noise from which pairs are tried: slow noise raises it so far
     joint_singles: int = 5  # refused effects of which pairs are fitted, where none passes alone
 
     # Indistinguishable: rivals in an effect's place.

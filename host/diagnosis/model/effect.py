@@ -173,6 +173,7 @@ class Effect:
     joins: tuple[tuple[str, str], ...] = ()  # effects (id, form) of one parameter each that it is the sum of, in their order
     filters: bool = False  # a linear law of its motion with memory: it can take noise out of a motion
     invariant: bool = False  # linear and time-invariant: before or behind a linear plant it does the same
+    rounded: bool = False  # a law without its corner: it takes the place of that law where the data call for it
     affine: bool = False  # a reading times a constant plus a constant: a state that is read begins elsewhere with it
 
     @property

@@ -51,6 +51,8 @@ SLOTS = (
     "drive_limit",
     "smooth",
     "smooth_speed",
+    "load_smooth",
+    "load_smooth_speed",
     "constant",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
@@ -96,6 +98,8 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     DRIVE_LIMIT,
     SMOOTH,
     SMOOTH_SPEED,
+    LOAD_SMOOTH,
+    LOAD_SMOOTH_SPEED,
     CONSTANT,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
@@ -130,9 +134,12 @@ def level_at(v: float, p: Array) -> float:
 
 
 @njit(cache=True)
-def _rising(v: float, p: Array) -> float:
-    """Friction at speed v of the law that rises with speed; nothing where there is none."""
-    return p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
+def _rising(v: float, load: float, p: Array) -> float:
+    """Friction at speed v of the laws that rise with speed, one of which follows the load; nothing where there is none."""
+    force = p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
+    if p[LOAD_SMOOTH_SPEED] > 0.0:
+        force += p[LOAD_SMOOTH] * abs(load) * math.tanh(v / p[LOAD_SMOOTH_SPEED])
+    return force
 
 
 @njit(cache=True)
@@ -161,6 +168,13 @@ def _slowed(v_free: float, lost: float, rise: float) -> float:
             break
         v = v - step if low < v - step < high else 0.5 * (low + high)
     return v
+
+
+@njit(cache=True)
+def _slowed_by_rising(v_free: float, load: float, h_over_m: float, p: Array) -> float:
+    """Speed after the laws that rise with speed (`_rising`) have acted over one step, one after the other."""
+    v = _slowed(v_free, h_over_m * p[SMOOTH], p[SMOOTH_SPEED])
+    return _slowed(v, h_over_m * p[LOAD_SMOOTH] * abs(load), p[LOAD_SMOOTH_SPEED])
 
 
 @njit(cache=True)
@@ -267,7 +281,7 @@ def along(
         dx = x[i] - x[i - 1] if i > 0 else 0.0
         slow = x[i] + (slow - x[i]) * decay
         out[i] = smooth_force(x[i], v[i], t[i], slow, p) + hysteresis(z, dx, v[i], load[i], p)
-        out[i] += _rising(v[i], p)
+        out[i] += _rising(v[i], load[i], p)
         if dry and p[STRIBECK_D] <= 0.0:
             out[i] += level_at(v[i], p) * (side[i] if side[i] != 0.0 else rest)
         if p[MASS2] > 0.0:
@@ -438,7 +452,7 @@ def run_axis(
                 else (u[i, j, 0] + more, u[i, j, 1] + more, u[i, j, 2] + more)
             )
             # Half the impulse of friction that rises with speed before the step, half after it (Strang 1968).
-            s = (s[0], _slowed(s[1], 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED]), s[2], s[3])
+            s = (s[0], _slowed_by_rising(s[1], load[i], 0.5 * h / m, p), s[2], s[3])
             x_old, v_old = s[0], s[1]
             dry = level_at(v_old, p) if p[STRIBECK_D] <= 0.0 else 0.0
             if short:
@@ -448,11 +462,11 @@ def run_axis(
                 x, v, x2, v2, a = _runge_kutta(s, push, begin_s + i * dt_s + j * h, h, slow, linear, p)
             if j == 0:
                 out[2, i] = a - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(a, -dry / m), dry / m)))
-                out[2, i] -= _rising(v_old, p) / m
+                out[2, i] -= _rising(v_old, load[i], p) / m
             if dry > 0.0:
                 v, further, stuck = _dry(v_old, v, a, dry, h, m)
                 x = x_old if stuck else x + further
-            v = _slowed(v, 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED])
+            v = _slowed_by_rising(v, load[i], 0.5 * h / m, p)
             s = (x, v, x2, v2)
             slow = x + (slow - x) * decay
             if remembers:

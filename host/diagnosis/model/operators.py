@@ -173,6 +173,24 @@ def second_order(x: Array, dt_s: float, lag_s: float, inertia_s2: float, start: 
     a, b = lag_s / dt_s, inertia_s2 / dt_s**2
     if b <= LEAST_INERTIA * max(a, LEAST_INERTIA):
         return lag(x, dt_s, max(a, LEAST_INERTIA) * dt_s, start)
+    return _second_order(x, dt_s, a, b, start, rate)[0]
+
+
+@njit(cache=True)
+def followed(x: Array, dt_s: float, lag_s: float, inertia_s2: float, start: float = 0.0, rate: float = 0.0) -> Array:
+    """Motion (n,) of a mass that `x` moves by a spring and a damper: inertia y'' + lag y' + y = x + lag x'.
+
+    It is m + lag m', m that of `second_order`, whose arguments these are: `start` and `rate` are of m. An inertia of zero is
+    not among them.
+    """
+    a, b = lag_s / dt_s, inertia_s2 / dt_s**2
+    mode, slope = _second_order(x, dt_s, a, b, start, rate)
+    return mode + a * slope
+
+
+@njit(cache=True)
+def _second_order(x: Array, dt_s: float, a: float, b: float, start: float, rate: float) -> tuple[Array, Array]:
+    """Output (n,) of `second_order` and its change in one sample's time (n,); lag and inertia in units of a sample."""
     # In units of one sample. On a ramp the output runs `a` samples behind; the deviation from that dies out freely, by
     # the exponential of [[0, 1], [-1/b, -a/b]]: (cosh s +- d/s sinh s, sinh s / s) exp(-d), s complex where it rings.
     d, w2 = 0.5 * a / b, 1.0 / b
@@ -185,16 +203,16 @@ def second_order(x: Array, dt_s: float, lag_s: float, inertia_s2: float, start: 
         even, odd = math.cos(root) * math.exp(-d), math.sin(root) / root * math.exp(-d)
     else:
         even, odd = math.exp(-d), math.exp(-d)
-    out = np.empty(x.size)
+    out, slope = np.empty(x.size), np.empty(x.size)
     y, v = x[0] + start, (x[1] - x[0] if start != 0.0 else 0.0) + rate * dt_s
-    out[0] = y
+    out[0], slope[0] = y, v
     for i in range(1, x.size):
         rise = x[i] - x[i - 1]
         off, slip = y - x[i - 1] + a * rise, v - rise
         y = x[i] - a * rise + (even + d * odd) * off + odd * slip
         v = rise - w2 * odd * off + (even - d * odd) * slip
-        out[i] = y
-    return out
+        out[i], slope[i] = y, v
+    return out, slope
 
 
 @njit(cache=True)

@@ -19,6 +19,7 @@ class SearchMove(Enum):
     JOINT = "it entered together with another one"
     SWAP = "it took the place of another one"
     REDUCE = "it took the place of a more general form"
+    ROUND = "it took the place of the same law with a corner"
     EQUATION = "an equation entered"
     EXCHANGE = "it stayed: no other one does better in its place"
     REFIT = "the model before it was fitted again from the nominal parameters found with it"
@@ -52,6 +53,7 @@ class Found:
     steps: list[Step]
     forms: list[Form] = field(default_factory=list)
     pairs: list[Fit] = field(default_factory=list)  # of two effects each, that do as well as the first one named
+    alike: list[Fit] = field(default_factory=list)  # the best with a law without its corner, which is as likely
 
     @property
     def last_trials(self) -> list[Trial]:

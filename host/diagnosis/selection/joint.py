@@ -13,7 +13,7 @@ from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, get_starts, minimize, set_starts
 from host.diagnosis.selection.refits import restarted
 from host.diagnosis.selection.screening import above_noise
-from host.diagnosis.selection.trial import Trial, bound_by, related, sure_together
+from host.diagnosis.selection.trial import Trial, bound_by, of_sampling, related, sure_together
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -40,9 +40,13 @@ def best_pair(problem: Problem, nominal: Fit, trials: list[Trial], fit_next: Fit
     rules = problem.rules
     singles = _singles(trials, rules.joint_singles)
     called_for = bool(singles) and singles[0].both.log_likelihood >= rules.pooled_log_likelihood
-    if not called_for and not above_noise(problem, nominal, rules.residual_over_noise):
+    if not called_for and not above_noise(problem, nominal, rules.joint_over_noise):
         return None  # nothing calls for an effect, so nothing calls for two
-    pairs = [(a, b) for a, b in itertools.combinations(singles, 2) if not related(a.candidate, b.candidate)]
+    pairs = [
+        (a, b)
+        for a, b in itertools.combinations(singles, 2)
+        if not (related(a.candidate, b.candidate) or of_sampling(a) or of_sampling(b))
+    ]
     found = []
     for count, (a, b) in enumerate(pairs):
         if problem.budget.spent():
@@ -64,7 +68,7 @@ def best_pair(problem: Problem, nominal: Fit, trials: list[Trial], fit_next: Fit
             set_starts(problem, top.starts)
             other = _alone(problem, nominal, top.fit)
             seconds += [t for t in fit_next(other, top.starts) if len(t.fit.terms) == 2]
-        for second in seconds:
+        for second in (t for t in seconds if not of_sampling(t)):
             set_starts(problem, second.starts)
             fit, passed = second.fit, _passed(problem, nominal, second.fit, second.starts)
             if passed is not None and all(
@@ -200,8 +204,12 @@ def _earned_over(problem: Problem, fit: Fit, alone: Fit) -> bool:
         held.log_likelihood >= rules.heldout_log_likelihood + rules.heldout_parameter_cost * more
         and trained.log_likelihood >= rules.heldout_log_likelihood + rules.parameter_penalty * more
     )
+    plain = (  # as of a single effect: so likely that noise cannot be the cause, gained in both parts
+        both.log_likelihood > rules.decisive_log_likelihood + rules.parameter_penalty * more
+        and min(held.log_likelihood, trained.log_likelihood) > rules.weak_log_likelihood
+    )
     return held.share >= rules.further_error_reduction and (
-        (shown and held.p_value <= rules.significance) or _pooled(problem, held, both, more)
+        (shown and held.p_value <= rules.significance) or _pooled(problem, held, both, more) or plain
     )
 
 

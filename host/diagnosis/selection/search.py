@@ -22,6 +22,7 @@ from host.diagnosis.estimation.fit import (
 from host.diagnosis.estimation.initial_state import start_again
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.corners import round_corners
 from host.diagnosis.selection.folds import with_other_recordings
 from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.joint import PairFit, best_pair, pair_first, pair_instead
@@ -71,6 +72,7 @@ def concluded(problem: Problem, found: Found, candidate_effects: list[Candidate]
         reduce(problem, found)
     if found.best.terms:
         found.best = refined(problem, found.best)
+    round_corners(problem, found)
     drop_unsure_events(problem, found, candidate_effects)
     drop_unsure(problem, found)
     return found

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from host.diagnosis import diagnose
-from host.diagnosis.estimation.feedback import find_feedback, freed
+from host.diagnosis.estimation.feedback import find_feedback, freed, unpredicted
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import Segment
@@ -87,6 +87,19 @@ def test_only_noise_that_comes_back_is_taken_off(through: float, share: float) -
     find_feedback([segment], [noise[None, :]], ("u",), RULES)
     left = float(np.var(freed(segment, 0, noise)) / np.var(noise))
     assert left == pytest.approx(share, abs=0.05)
+
+
+def test_noise_that_comes_back_in_the_same_row_is_taken_off_where_later_rows_hold_more_of_it() -> None:
+    rng = np.random.default_rng(4)
+    noise, u = rng.standard_normal(6000), rng.standard_normal(6000)
+    u[2:] += 1.5 * noise[:-2]
+    u += 0.35 * noise  # a thirtieth of the variance: less than shows feedback alone
+    t, every = np.arange(6000) / 100.0, np.ones(6000, dtype=bool)
+    recording = Recording("a", t, 0.01, True, {"u": u}, every, ~every)
+    segment = Segment(recording, noise[None, :], every, ~every, {"u": u})
+    find_feedback([segment], [noise[None, :]], ("u",), RULES)
+    new = unpredicted(u)
+    assert abs(np.corrcoef(new, freed(segment, 0, noise))[0, 1]) < 1e-3
 
 
 def looped(number: int, coulomb_N: float = 0.0, noise_m: float = 2e-4, load_kg: float = 0.0) -> dict[str, Any]:

@@ -28,6 +28,24 @@ def test_a_pair_is_found_where_every_single_effect_is_refused(monkeypatch: pytes
     assert [step.move for step in verdict.diagnosis.found.steps][:1] == [SearchMove.STOP]
 
 
+@pytest.mark.slow
+def test_a_pair_is_found_where_the_nominal_model_leaves_less_than_twice_the_noise() -> None:
+    """A drift and a coupling, each of the size of the noise: neither alone leaves white noise, so neither is sure."""
+
+    def drifting(number: int) -> dict[str, Any]:
+        columns, rng = make.gear(number, fastest_Hz=1.0), np.random.default_rng(number)
+        t, scale = columns["t"], float(np.std(columns["load"]))
+        other = np.sin(2.0 * np.pi * 0.07 * t + number) + np.sin(2.0 * np.pi * 0.031 * t)
+        load = columns["load"] + 0.011 * scale * other + 0.03 * scale * t / t[-1]
+        return {**columns, "other": other, "load": load + 0.012 * scale * rng.standard_normal(t.size)}
+
+    nominal = make.gear_nominal()
+    nominal["channels"]["other"] = {"column": "other", "unit": "rad"}
+    nominal["link"][0]["others"] = ["other"]
+    verdict = diagnose([drifting(number) for number in (1, 2, 3)], nominal).as_dict()
+    assert {effect["id"] for effect in verdict["effects"]} == {"coupling", "sensor_drift"}
+
+
 def test_no_pair_is_tried_where_nothing_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     fitted: list[str] = []
     monkeypatch.setattr("host.diagnosis.selection.joint._fitted", lambda *given: fitted.append("pair"))

@@ -94,6 +94,23 @@ def test_a_mode_with_partial_participation() -> None:
     assert effect["parameters"]["mode_share"]["value"] == pytest.approx(0.3, rel=0.05)
 
 
+def test_a_load_behind_a_spring_with_a_damper_parallel_to_it() -> None:
+    w, z = 2.0 * np.pi * 3.4, 0.2
+
+    def turned(x: Motion) -> Array:
+        def rates(t: float, y: Array) -> list[float]:
+            slope = float(x(t + 1e-4) - x(t - 1e-4)) / 2e-4
+            return [y[1], w * w * (float(x(t)) - y[0]) + 2.0 * z * w * (slope - y[1])]
+
+        return integrated(rates, 2)
+
+    verdict, effect = found(turned)
+    assert len(verdict["effects"]) == 1 and effect["id"] == "resonance" and at_noise(verdict)
+    p = effect["parameters"]
+    assert p["frequency_Hz"]["value"] == pytest.approx(3.4, rel=0.01)  # 50 samples a second, with straight lines between
+    assert p["damping_ratio"]["value"] == pytest.approx(0.2, rel=0.15)
+
+
 def test_several_jumps() -> None:
     def lost(x: Motion) -> Array:
         y = x(T).copy()
@@ -249,3 +266,19 @@ def test_friction_depends_on_a_force_that_the_nominal_model_does_not_call_a_load
     assert effect["id"] == "load_dependent_friction"
     # 0.0485 with the interval 0.0470 to 0.04995, which misses 0.05: the smoothed speed gives less friction at reversals.
     assert effect["parameters"]["coefficient"]["value"] == pytest.approx(0.05, rel=0.05)
+
+
+@pytest.mark.parametrize("follows", [False, True])
+@pytest.mark.parametrize("law", ["tanh", "algebraic"])
+def test_the_amount_of_a_friction_without_a_corner(law: str, follows: bool) -> None:
+    def rubbing(t: Array, x: Array, normal: Array) -> Array:
+        v = np.gradient(x, 1e-3)
+        rising = np.tanh(v / 6e-4) if law == "tanh" else v / np.hypot(v, 2e-4)
+        return np.asarray((0.06 * normal if follows else 0.12) * rising)
+
+    (effect,) = diagnose([pressed(seed, 8.0, rubbing) for seed in (1, 2, 3)], PRESSED).as_dict()["effects"]
+    name, true = ("coefficient", 0.06) if follows else ("force_N", 0.12)
+    assert effect["id"] == ("load_dependent_friction" if follows else "coulomb_friction")
+    amount = effect["parameters"][name]
+    assert amount["value"] == pytest.approx(true, rel=0.03)  # with a corner it is a tenth too small
+    assert law == "algebraic" or amount["ci95"][0] <= true <= amount["ci95"][1]

@@ -86,6 +86,7 @@ _GEAR_EFFECTS = (
         "resonance",
         _GEAR,
         lambda s, c: {"frequency_Hz": 1.0 / (2.0 * np.pi * c.slow_s * 0.3 * max(s, 0.02) ** 0.5)},
+        same=("compliance",),  # the spring of the load also gives way to the recorded torque
         compared=("frequency_Hz",),
     ),
     Plantable(
