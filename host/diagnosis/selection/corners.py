@@ -26,9 +26,10 @@ def round_corners(problem: Problem, found: Found) -> None:
     """
     rules, found.alike = problem.rules, []
     for term in found.best.terms:
-        step, trial = _without_corner(found, term)
-        if step is None or trial is None or problem.budget.spent():
+        tried = _without_corner(found, term)
+        if tried is None or problem.budget.spent():
             continue
+        step, trial = tried
         begun, before = get_starts(problem), found.best
         other = _in_its_place(problem, before, term, trial)
         ahead = problem.gain("both", before.residuals, other.residuals)
@@ -66,16 +67,18 @@ def _names(problem: Problem, fit: Fit) -> list[tuple[str, ...]]:
     return [*nominal, *own]
 
 
-def _without_corner(found: Found, term: Term) -> tuple[Step | None, Trial | None]:
-    """The last step and trial of the law of `term` without its corner, at its place."""
+def _without_corner(found: Found, term: Term) -> tuple[Step, Trial] | None:
+    """The last step and trial of the law of `term` without its corner, at its place; None where none was tried."""
     own = term.candidate
+    if own.effect.rounded:
+        return None
     for step in reversed(found.steps):
         for trial in step.trials:
             other = trial.candidate
             same = (other.effect.id, other.port.name, other.source) == (own.effect.id, own.port.name, own.source)
-            if same and other.effect.rounded and not own.effect.rounded:
+            if same and other.effect.rounded:
                 return step, trial
-    return None, None
+    return None
 
 
 def _in_its_place(problem: Problem, best: Fit, term: Term, trial: Trial) -> Fit:

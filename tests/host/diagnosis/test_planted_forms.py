@@ -264,8 +264,9 @@ def test_friction_depends_on_a_force_that_the_nominal_model_does_not_call_a_load
     verdict = diagnose([pressed(seed, 8.0, rubbing) for seed in (1, 2)], PRESSED).as_dict()
     (effect,) = verdict["effects"]
     assert effect["id"] == "load_dependent_friction"
-    # 0.0485 with the interval 0.0470 to 0.04995, which misses 0.05: the smoothed speed gives less friction at reversals.
-    assert effect["parameters"]["coefficient"]["value"] == pytest.approx(0.05, rel=0.05)
+    coefficient = effect["parameters"]["coefficient"]
+    assert coefficient["value"] == pytest.approx(0.05, rel=0.05)
+    assert coefficient["ci95"][0] <= 0.05 <= coefficient["ci95"][1]
 
 
 @pytest.mark.parametrize("follows", [False, True])
