@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
 from host.diagnosis.estimation.noise import Noise
@@ -182,12 +183,9 @@ class Problem:
         rows = []
         used = [segment for segment in self.segments if segment.fit.any()]
         for segment, out in zip(used, self.simulate_all(used, terms, values), strict=True):
-            r = (segment.y - out) / self.scale[:, None]
             first = self.unseen(segment, terms, values)
-            r[:, :first] = np.where(np.isfinite(segment.y[:, :first]), unseen, np.nan)
             last = segment.n - self.ends(segment, terms, values)
-            r[:, last:] = np.where(np.isfinite(segment.y[:, last:]), unseen, np.nan)
-            rows.append(np.clip(np.nan_to_num(r[:, segment.fit], nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
+            rows.append(_weighted(segment.y, np.ascontiguousarray(out), segment.fit, self.scale, first, last, unseen))
         return np.concatenate(rows)
 
     def seen_share(self, terms: tuple[Term, ...], values: Array) -> float:
@@ -196,6 +194,27 @@ class Problem:
         hidden = sum(int(segment.fit[: self.unseen(segment, terms, values)].sum()) for segment in used)
         hidden += sum(int(segment.fit[segment.n - self.ends(segment, terms, values) :].sum()) for segment in used)
         return 1.0 - hidden / max(sum(int(segment.fit.sum()) for segment in used), 1)
+
+
+@njit(cache=True, error_model="numpy")
+def _weighted(
+    measured: Array, out: Array, fit: npt.NDArray[np.bool_], scale: Array, first: int, last: int, unseen: float
+) -> Array:
+    """Residuals (outputs * samples to fit,) over `scale`, cut at FAR; 0 where nothing was measured, and `unseen` before
+    sample `first` and from `last` on.
+    """
+    found = np.empty(measured.shape[0] * int(np.sum(fit)))
+    at = 0
+    for row in range(measured.shape[0]):
+        for i in range(measured.shape[1]):
+            if not fit[i]:
+                continue
+            r = (measured[row, i] - out[row, i]) / scale[row]
+            if i < first or i >= last:
+                r = unseen if np.isfinite(measured[row, i]) else 0.0
+            found[at] = 0.0 if np.isnan(r) else min(max(r, -FAR), FAR)
+            at += 1
+    return found
 
 
 def _ahead_s(segment: Segment, terms: tuple[Term, ...], values: Array) -> float:

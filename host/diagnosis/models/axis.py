@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.model.dataset import Recording
@@ -41,8 +42,9 @@ FINER = 8  # points in each sub-step at which a held input is computed that an e
 class AxisSegment(Segment):
     """A recording with its smoothed motion, and what either way of comparing needs of it."""
 
-    x: Array = field(default_factory=lambda: np.zeros(0))  # (n,) reading, smoothed, and its rate
+    x: Array = field(default_factory=lambda: np.zeros(0))  # (n,) reading, smoothed, its rate, and the rate of that
     v: Array = field(default_factory=lambda: np.zeros(0))
+    a: Array = field(default_factory=lambda: np.zeros(0))
     substeps: int = 1  # of the integration, in one period
     stages: Array | None = None  # (n, substeps, 3) recorded input at the stages of Runge-Kutta
     balance: balance.Balance | None = None
@@ -149,7 +151,8 @@ class AxisModel(Model):
         if spec.reads == "position" and np.max(kick) > KICK * np.median(np.abs(np.diff(segment.inputs[spec.input]))):
             spread[1] = max(spread[1], abs(v[0]))  # the window reads the speed behind the kick, not that before it
         segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
-        segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
+        segment.x, segment.v, segment.a = x, v, np.gradient(v, recording.dt_s)
+        segment.substeps = self._substeps(segment)
         along = motion if spec.reads == "position" else place
         segment.tolerances[name] = tolerance_of(along, float(np.ptp(along)))
         if spec.reads == "position":
@@ -169,8 +172,8 @@ class AxisModel(Model):
             recorded = segment.inputs[spec.input]
             segment.force_noise = recorded - calm(recorded, reading_noise(recorded), 1.0)
             segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
-            segment.rests = balance.at_rest(x, segment.tolerances[name], segment.balance.bump.size // 2)
-            segment.spread, segment.read_motion = segment.balance.bump.size // 2, recording.channels[spec.output]
+            segment.rests = balance.at_rest(x, segment.tolerances[name], segment.balance.support.size // 2)
+            segment.spread, segment.read_motion = segment.balance.support.size // 2, recording.channels[spec.output]
         return segment
 
     def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:
@@ -286,6 +289,7 @@ class AxisModel(Model):
             measured = balance.Motion(
                 segment.x,
                 segment.v,
+                segment.a,
                 segment.tolerances[spec.subsystem],
                 segment.start.get(spec.subsystem, 0.0),
                 segment.rests,
@@ -395,8 +399,7 @@ def stages(u: Array, substeps: int, hold: str) -> Array:
     if hold == "zero":
         return np.broadcast_to(u[:, None, None], (n, substeps, 3)).copy()
     points = _between(u, 2 * substeps, hold)
-    place = 2 * np.arange(n * substeps)[:, None] + np.arange(3)
-    return np.asarray(points[place].reshape(n, substeps, 3))
+    return np.ascontiguousarray(sliding_window_view(points, 3)[::2].reshape(n, substeps, 3))
 
 
 def averaged(u: Array, n: int, substeps: int) -> Array:
@@ -415,7 +418,8 @@ def _between(u: Array, factor: int, hold: str) -> Array:
     """A continuous input at `factor` points a sample, (n * factor + 1,)."""
     n = u.size
     if hold == "linear":
-        return np.append(np.interp(np.arange(n * factor) / factor, np.arange(n), u), u[-1])
+        between = u[:-1, None] + np.diff(u)[:, None] * (np.arange(factor) / factor)
+        return np.concatenate((between.ravel(), np.full(factor + 1, u[-1])))
     from scipy.signal import resample
 
     pad = min(n - 1, 400)

@@ -11,11 +11,12 @@ signal is differentiated; samples whose test function would reach over an end or
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import fftconvolve
+from numba import njit
+from scipy import fft
 
 from host.diagnosis.estimation.noise import ORDER, Noise, NoiseSource, autoregression, estimate, quiescent
 from host.diagnosis.model.force_kernel import (
@@ -43,13 +44,34 @@ AT_REST = 0.05  # of the largest spread of a part: below it the input rests
 
 
 @dataclass(frozen=True)
+class Kernel:
+    """Weights (2 half + 1,) of a convolution, and their spectrum for records of one length."""
+
+    weights: Array
+    spectrum: npt.NDArray[np.complex128]
+    size: int  # of the transform
+
+    @classmethod
+    def of(cls, weights: Array, n: int) -> Kernel:
+        """Return the kernel for records of n samples."""
+        size = int(fft.next_fast_len(n + weights.size - 1, real=True))
+        return cls(weights, np.asarray(fft.rfft(weights, size)), size)
+
+    def along(self, values: Array) -> Array:
+        """Convolution (n,) with `values` (n,), of no meaning within half a kernel of the ends."""
+        first = self.weights.size // 2
+        return np.asarray(fft.irfft(fft.rfft(values, self.size) * self.spectrum, self.size)[first : first + values.size])
+
+
+@dataclass(frozen=True)
 class Balance:
     """Test function of one recording, and what it leaves of the motion."""
 
     input: str  # channel of the force
-    bump: Array  # (2 half + 1,) test function
-    held: Array  # its integral over what each sample of the force stands for
-    recorded: Array  # (n,) the force as it is recorded, under that
+    bump: Kernel  # test function
+    held: Kernel  # its integral over what each sample of the force stands for
+    force: Array  # (n,) as it is recorded
+    recorded: Array  # (n,) the same under `held`
     rows: Array  # (3, n) acceleration, speed and place of the motion under the test function
     noise: Noise
     kernels: Array  # (3, 2 half + 1) of the rows
@@ -57,17 +79,19 @@ class Balance:
     length: float  # half its length, s
     sigma_motion: float  # white noise of the motion
     sigma_force: float  # and of the force
+    finer: dict[int, Kernel] = field(default_factory=dict)  # `held` for so many held points in each sample
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Smoothed motion and speed (n,), the movement below which nothing has moved, and the friction held at first.
+    """Smoothed motion, its two derivatives (n,); the movement below which nothing has moved; friction held at first.
 
     At rest (n,) friction is what holds the axis against the input `pushed` (n,), freed of noise.
     """
 
     x: Array
     v: Array
+    a: Array
     tolerance: float
     start: float
     rests: npt.NDArray[np.bool_]
@@ -95,15 +119,28 @@ def prepare(segment: Segment, force: str, motion: Array, seen: npt.NDArray[np.bo
     bend -= bump * bend.sum()
     bend *= 2.0 / float(bend @ s**2)
     kernels = np.array([bend, slope, bump])
-    rows = np.array([_along_record(motion, kernel) for kernel in kernels])
+    rows = np.array([Kernel.of(kernel, segment.n).along(motion) for kernel in kernels])
     gap = np.concatenate((np.zeros(1), np.cumsum(~seen)))
     first, last = np.maximum(np.arange(segment.n) - half, 0), np.minimum(np.arange(segment.n) + half + 1, segment.n)
     whole = (np.arange(segment.n) >= half) & (np.arange(segment.n) < segment.n - half) & (gap[last] == gap[first])
     segment.y[:, ~whole] = np.nan
     sigma_motion = white_level(motion)
     held, under, noise = _held_force(segment.inputs[force], rows, kernels, s, length, sigma_motion, hold)
-    sigma_force = reading_noise(segment.inputs[force])
-    return Balance(force, bump, held, under, rows, noise, kernels, s, length, sigma_motion, sigma_force)
+    recorded = segment.inputs[force]
+    return Balance(
+        force,
+        Kernel.of(bump, segment.n),
+        held,
+        recorded,
+        under,
+        rows,
+        noise,
+        kernels,
+        s,
+        length,
+        sigma_motion,
+        sigma_force=reading_noise(recorded),
+    )
 
 
 def held_as(balance: Balance, segment: Segment, hold: str) -> Balance:
@@ -112,20 +149,22 @@ def held_as(balance: Balance, segment: Segment, hold: str) -> Balance:
     held, under, noise = _held_force(
         recorded, balance.rows, balance.kernels, balance.support, balance.length, balance.sigma_motion, hold
     )
-    return replace(balance, held=held, recorded=under, noise=noise)
+    return replace(balance, held=held, force=recorded, recorded=under, noise=noise)
 
 
 def _held_force(
     recorded: Array, rows: Array, kernels: Array, s: Array, length: float, sigma_motion: float, hold: str
-) -> tuple[Array, Array, Noise]:
+) -> tuple[Kernel, Array, Noise]:
     """Weights of force samples under the test function, the recorded force (n,) there, and the noise."""
-    held = _held(s, length, float(s[1] - s[0]), hold)
+    weights = _held(s, length, float(s[1] - s[0]), hold)
+    held = Kernel.of(weights, recorded.size)
     half = s.size // 2
     kept = slice(half, recorded.size - half)
     columns = np.vstack([rows, np.ones(recorded.size)])[:, kept].T
-    under = _along_record(recorded, held)
+    under = held.along(recorded)
     found: Array = np.asarray(np.linalg.lstsq(columns, under[kept], rcond=1e-12)[0])
-    return held, under, _noise(np.asarray(found[:3], dtype=np.float64), sigma_motion, reading_noise(recorded), kernels, held)
+    noise = _noise(np.asarray(found[:3], dtype=np.float64), sigma_motion, reading_noise(recorded), kernels, weights)
+    return held, under, noise
 
 
 def _bump(s: Array, length: float) -> tuple[Array, Array, Array]:
@@ -151,17 +190,17 @@ def _held(s: Array, length: float, dt_s: float, hold: str) -> Array:
     return np.asarray(weights / weights.sum())
 
 
-def _finely(balance: Balance, dt_s: float, finer: int) -> Array:
-    """Weights of a force with `finer` held points in each sample under the test function."""
+def _finely(balance: Balance, dt_s: float, finer: int, n: int) -> Kernel:
+    """Weights of a force (n,) with `finer` held points in each sample under the test function."""
+    if finer == 1:
+        return balance.held
+    if finer in balance.finer:
+        return balance.finer[finer]
     reach = (balance.support.size // 2 + 1) * finer
     at: Array = (np.arange(-reach, reach + 1, dtype=np.float64) - 0.5) * (dt_s / finer)
     weights = _bump(at, balance.length)[0]
-    return np.asarray(weights / weights.sum())
-
-
-def _along_record(values: Array, kernel: Array) -> Array:
-    """Convolution (n,), of no meaning within half a kernel of the ends."""
-    return np.asarray(fftconvolve(values, kernel, mode="same"))
+    balance.finer[finer] = Kernel.of(np.asarray(weights / weights.sum()), n)
+    return balance.finer[finer]
 
 
 def _noise(coefficients: Array, sigma_motion: float, sigma_force: float, kernels: Array, held: Array) -> Noise:
@@ -186,13 +225,14 @@ def quieted(balance: Balance, linear: Array, p: Array, dt_s: float) -> float:
     """
     if p[MASS2] <= 0.0 and p[MAXWELL_K] == 0.0:
         return 1.0
-    size = 1 << (2 * balance.bump.size).bit_length()
+    size = 1 << (2 * balance.support.size).bit_length()
     w = 2j * np.pi * np.fft.rfftfreq(size, dt_s)
     second = 2.0 * p[DAMPING2] * p[OMEGA2] * w + p[OMEGA2] ** 2
     added = p[MASS2] * w**2 * second / (w**2 + second) if p[MASS2] > 0.0 else np.zeros_like(w)
     if p[MAXWELL_K] != 0.0:
         added = added + p[MAXWELL_K] * w * p[MAXWELL_T] / (1.0 + w * p[MAXWELL_T])
-    law, bump, held = (np.fft.rfft(kernel, size) for kernel in (linear[:3] @ balance.kernels, balance.bump, balance.held))
+    weights = (linear[:3] @ balance.kernels, balance.bump.weights, balance.held.weights)
+    law, bump, held = (np.fft.rfft(each, size) for each in weights)
     of_motion, of_force = balance.sigma_motion * (law + added * bump), balance.sigma_force * held
     power = np.abs(of_motion) ** 2 + np.abs(of_force) ** 2
     return float(np.sqrt((2.0 * power.sum() - power[0] - power[-1]) / size)) / balance.noise.sigma
@@ -211,7 +251,7 @@ def _forces(segment: Segment, motion: Motion, p: Array) -> Array:
     return along(
         motion.x,
         motion.v,
-        np.gradient(motion.v, recording.dt_s),
+        motion.a,
         np.zeros(segment.n),
         recording.time_s,
         recording.dt_s,
@@ -241,10 +281,12 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
             other = _forces(segment, motion, smooth)
             holds = np.clip(motion.pushed + linear[3] - linear[2] * motion.x - other, -most, most)
             dry = np.where(motion.rests, other + holds, dry)
-        need = need + _along_record(dry, balance.bump)
-    finer = force.size // segment.n
-    applied = _along_record(force, balance.held if finer == 1 else _finely(balance, recording.dt_s, finer))[::finer]
-    size = _passed(applied, balance.recorded, np.isfinite(segment.y[0]))
+        need = need + balance.bump.along(dry)
+    applied, size = balance.recorded, 1.0
+    if force is not balance.force:
+        finer = force.size // segment.n
+        applied = _finely(balance, recording.dt_s, finer, force.size).along(force)[::finer]
+        size = _passed(applied, balance.recorded, np.isfinite(segment.y[0]))
     size *= min(quieted(balance, linear, p, recording.dt_s), 1.0)
     return np.asarray(need - applied)[None, :] / min(max(size, 1e-6), 1.0)
 
@@ -256,7 +298,19 @@ def _passed(applied: Array, recorded: Array, compared: npt.NDArray[np.bool_]) ->
 
     applied, recorded: (n,), under the test function; compared: (n,).
     """
-    parts = [np.std(part, axis=1) for part in np.array_split(np.array([applied, recorded])[:, compared], PARTS, axis=1)]
+    parts = _spreads(applied, recorded, compared)
     moved = [(a, r) for a, r in parts if r > 0.0]
     least = AT_REST * max((r for _, r in moved), default=0.0)
     return float(np.median([a / r for a, r in moved if r > least])) if moved else 1.0
+
+
+@njit(cache=True)
+def _spreads(a: Array, b: Array, used: npt.NDArray[np.bool_]) -> Array:
+    """Standard deviations (PARTS, 2) of `a` and `b` (n,) in equal parts of their `used` samples."""
+    at = np.flatnonzero(used)
+    found = np.zeros((PARTS, 2))
+    for part in range(PARTS):
+        inside = at[part * at.size // PARTS : (part + 1) * at.size // PARTS]
+        if inside.size:
+            found[part, 0], found[part, 1] = np.std(a[inside]), np.std(b[inside])
+    return found
