@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass
+
 import numpy as np
 
+from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, get_starts, minimize, set_starts
 from host.diagnosis.estimation.initial_state import begun_again
 from host.diagnosis.estimation.uncertainty import intervals
@@ -12,7 +16,7 @@ from host.diagnosis.selection.folds import unexcited
 from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.refits import fit_nominal, fit_without, refined, restarted
 from host.diagnosis.selection.screening import term_of, without
-from host.diagnosis.selection.trial import Trial, at_bound, related, richer_gain, vanished
+from host.diagnosis.selection.trial import Trial, at_bound, related, richer_gain, same_place, vanished
 
 
 def prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
@@ -41,53 +45,88 @@ def prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
 
 
 def reduce(problem: Problem, found: Found) -> None:
-    """Each of several effects replaced by a simpler shape that does nearly as well in its place.
+    """Each of several effects replaced by a simpler one that does nearly as well in its place.
 
     A richer shape may have entered because the simpler one needed another effect as well: a limit of speed that is never
     reached outdoes the lag that it contains by chance alone. What the richer one takes more has to be what a richer one
-    has to take to be preferred where single effects are ranked (`rank`).
+    has to take to be preferred where single effects are ranked (`rank`). An effect of another kind has to be likelier than
+    the richer one, less the price of parameters. Of those that are as simple, the likeliest is taken.
     """
     for term in found.best.terms:
         if problem.budget.spent():
             return
         if not any(term is other for other in found.best.terms):
             continue  # it left with another of its name, which was reduced
-        for trial in _simpler(found, term):
-            rest, values = without(found.best, problem, (term.candidate.key,))
-            simple = trial.fit.terms[-1]
-            own = {p.name: float(value) for p, value in zip(term.parameters, found.best.values_of(term), strict=True)}
-            alone = zip(simple.parameters, trial.fit.values_of(simple), strict=True)
-            begun, key = get_starts(problem), simple.candidate.key
-            less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal)
-            start = np.array([min(max(own.get(p.name, float(value)), p.low), p.high) for p, value in alone])
-            begin = np.concatenate((values, start))
-            other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
-            other = restarted(problem, finish(problem, begun_again(problem, other)), simple.candidate)
-            earned = problem.gain("both", less.residuals, found.best.residuals)
-            ahead = problem.gain("both", other.residuals, found.best.residuals)
-            more = found.best.fitted - other.fitted
-            if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
-                found.steps.append(Step(SearchMove.REDUCE, key, ahead, [trial]))
-                found.best = other
+        tried = _simpler(found, term, problem.rules.swap_fits)
+        if not tried:
+            continue
+        begun, best = get_starts(problem), found.best
+        less = fit_without(problem, best, (term.candidate.key,), nominal=found.nominal)
+        earned = problem.gain("both", less.residuals, best.residuals)
+        set_starts(problem, begun)
+        for _, as_simple in itertools.groupby(tried, key=lambda trial: trial.fit.terms[-1].fitted):
+            passed = [end for trial in as_simple if (end := _in_its_place(problem, best, term, trial, earned)) is not None]
+            if passed:
+                gains = [problem.gain("both", less.residuals, end.fit.residuals).log_likelihood for end in passed]
+                taken = passed[int(np.argmax(gains))]
+                ahead = problem.gain("both", taken.fit.residuals, best.residuals)
+                found.steps.append(Step(SearchMove.REDUCE, taken.trial.candidate.key, ahead, [p.trial for p in passed]))
+                found.best = taken.fit
+                set_starts(problem, taken.starts)
                 break
-            set_starts(problem, begun)
 
 
-def _simpler(found: Found, term: Term) -> list[Trial]:
-    """Trials of the simpler shapes that `term` contains, at its place, each once."""
+@dataclass(frozen=True)
+class _Simpler:
+    """A fit with the effect of `trial` in the place of a richer one, and its starts of memory."""
+
+    trial: Trial
+    fit: Fit
+    starts: list[dict[str, float]]
+
+
+def _in_its_place(problem: Problem, best: Fit, term: Term, trial: Trial, earned: Gain) -> _Simpler | None:
+    """`best` with the simpler effect of `trial` in the place of `term`; None where it takes too little.
+
+    earned: what `term` takes. Leaves the starts of memory as they are.
+    """
+    begun, simple = get_starts(problem), trial.fit.terms[-1]
+    rest, values = without(best, problem, (term.candidate.key,))
+    own = {p.name: float(value) for p, value in zip(term.parameters, best.values_of(term), strict=True)}
+    alone = zip(simple.parameters, trial.fit.values_of(simple), strict=True)
+    start = np.array([min(max(own.get(p.name, float(value)), p.low), p.high) for p, value in alone])
+    begin = np.concatenate((values, start))
+    other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
+    other = restarted(problem, finish(problem, begun_again(problem, other)), simple.candidate)
+    ahead = problem.gain("both", other.residuals, best.residuals)
+    more = best.fitted - other.fitted
+    contained = _contained(trial, term)
+    most = richer_gain(earned, more, problem.rules) if contained else problem.rules.parameter_penalty * more
+    end = _Simpler(trial, other, get_starts(problem))
+    set_starts(problem, begun)
+    return end if ahead.log_likelihood < most and not at_bound(other) else None
+
+
+def _contained(trial: Trial, term: Term) -> bool:
+    own = term.candidate
+    return trial.candidate.effect.id in own.effect.contains and related(trial.candidate, own)
+
+
+def _simpler(found: Found, term: Term, others: int) -> list[Trial]:
+    """Trials of effects with fewer parameters than `term`, at its place, each once, the simplest first: all shapes that it
+    contains, and the likeliest `others`.
+    """
     active = {t.candidate.key for t in found.best.terms}
     kept: dict[str, Trial] = {}
     for step in reversed(found.steps):
         for trial in step.trials:
-            own = trial.fit.terms[-1]
-            if (
-                trial.candidate.effect.id in term.candidate.effect.contains
-                and related(trial.candidate, term.candidate)
-                and own.fitted < term.fitted
-                and trial.candidate.key not in active
-            ):
-                kept.setdefault(trial.candidate.key, trial)
-    return sorted(kept.values(), key=lambda trial: trial.fit.terms[-1].fitted)
+            key, fewer = trial.candidate.key, trial.fit.terms[-1].fitted < term.fitted
+            if fewer and same_place(trial.candidate, term.candidate) and key not in active and not trial.replaced:
+                kept.setdefault(key, trial)
+    shapes = [trial for trial in kept.values() if _contained(trial, term)]
+    rest = [trial for trial in kept.values() if not _contained(trial, term)]
+    rest.sort(key=lambda trial: -trial.both.log_likelihood)
+    return sorted([*shapes, *rest[:others]], key=lambda trial: trial.fit.terms[-1].fitted)
 
 
 def drop_unsure(problem: Problem, found: Found) -> None:

@@ -160,20 +160,21 @@ def worth_fitting(problem: Problem, best: Fit, ranked: list[Screened]) -> list[S
 
 
 def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened]) -> list[Trial]:
-    """`trials`, and the simpler shapes of the first that were screened but not fitted; ranked again.
+    """`trials`, and the simpler shapes of the first, and of what is likelier by more parameters, that were screened but not
+    fitted; ranked again.
 
     A richer shape can promise more than each of the simpler ones it contains, and several rich ones fill the places of a
     port. Which of them the data call for shows only where all are fitted.
     """
     if not trials or problem.budget.spent():
         return trials
-    top, fitted = trials[0].candidate, {trial.candidate.key for trial in trials}
+    least, fitted = trials[0].both.log_likelihood, {trial.candidate.key for trial in trials}
+    richer = [t.candidate for t in trials if t is trials[0] or (t.both.log_likelihood >= least and good_enough(t, best))]
     missing = [
         item
         for item in ranked
         if item.candidate.key not in fitted
-        and item.candidate.effect.id in top.effect.contains
-        and related(item.candidate, top)
+        and any(item.candidate.effect.id in c.effect.contains and related(item.candidate, c) for c in richer)
         and item.promise > problem.rules.screening_log_likelihood
     ]
     if not missing:

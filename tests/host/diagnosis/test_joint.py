@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from host.diagnosis import diagnose
+from host.diagnosis.estimation.fit import set_starts
 from host.diagnosis.selection import search
-from host.diagnosis.selection.found import SearchMove
+from host.diagnosis.selection.found import Found, SearchMove
+from host.diagnosis.selection.removal import reduce
+from tests.host.diagnosis import test_hold as slides
 from tests.host.proof import everyday as make
 
 
@@ -44,6 +47,18 @@ def test_a_pair_is_found_where_the_nominal_model_leaves_less_than_twice_the_nois
     nominal["link"][0]["others"] = ["other"]
     verdict = diagnose([drifting(number) for number in (1, 2, 3)], nominal).as_dict()
     assert {effect["id"] for effect in verdict["effects"]} == {"coupling", "sensor_drift"}
+
+
+@pytest.mark.slow
+def test_a_delay_takes_the_place_of_a_mode_that_does_as_well_by_more_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slides, "NOISE", 2e-3)
+    diagnosis = diagnose([slides.slide(n, "linear", 0.017) for n in (1, 2, 3)], slides.nominal("linear")).diagnosis
+    first = diagnosis.found.steps[0]
+    mode = next(trial for trial in first.trials if trial.candidate.key == "resonance@slide_drive")
+    found = Found(diagnosis.found.nominal, mode.fit, [first])
+    set_starts(diagnosis.problem, mode.starts)
+    reduce(diagnosis.problem, found)
+    assert [term.candidate.key for term in found.best.terms] == ["latency@slide_drive"]
 
 
 def test_no_pair_is_tried_where_nothing_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
