@@ -49,7 +49,7 @@ def verdict_of(folder: Path, files: list[Path], out: str) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize(("plant", "name"), [(late, "latency"), (lagging, "rate_lag")])
+@pytest.mark.parametrize(("plant", "name"), [(late, "latency"), pytest.param(lagging, "rate_lag", marks=pytest.mark.long)])
 def test_the_set_gets_smaller_with_the_recording_of_the_script(
     tmp_path: Path, plant: Callable[[Array, Array], Array], name: str
 ) -> None:

@@ -54,7 +54,7 @@ def dragged(rng: np.random.Generator, force_N: float, slow_m_per_s: float) -> di
     return {"t": t, "f": drive, "x": out + 2e-5 * rng.standard_normal(t.size)}
 
 
-@pytest.mark.parametrize("slow", [0.0005, 0.01, 0.03])
+@pytest.mark.parametrize("slow", [0.0005, *(pytest.param(slow, marks=pytest.mark.long) for slow in (0.01, 0.03))])
 def test_friction_that_is_smaller_at_low_speed_is_dry_friction(slow: float) -> None:
     rng = np.random.default_rng(3)
     law = {**SPRUNG, "axis": {**SPRUNG["axis"], "reads": "position", "hold": "linear"}}

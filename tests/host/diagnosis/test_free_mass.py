@@ -57,7 +57,13 @@ def test_nothing_is_missing(loop: str, noise_m: float) -> None:
 
 @pytest.mark.parametrize(
     ("loop", "noise_m", "friction_N"),
-    [("steps", 5e-5, 0.3), ("steps", 1e-4, 0.6), ("steps", 1.5e-4, 0.9), ("smooth", 1e-4, 0.5), ("pulses", 6e-4, 0.4)],
+    [
+        ("steps", 5e-5, 0.3),
+        pytest.param("steps", 1e-4, 0.6, marks=pytest.mark.long),
+        pytest.param("steps", 1.5e-4, 0.9, marks=pytest.mark.long),
+        ("smooth", 1e-4, 0.5),
+        ("pulses", 6e-4, 0.4),
+    ],
 )
 def test_friction_is_named_alone(loop: str, noise_m: float, friction_N: float) -> None:
     """A mass that sticks was given a dead zone of the drive (0.92) and a resonance (0.90)."""
@@ -117,7 +123,10 @@ def pushed(number: int, noise_m: float, acts: Callable[[Array], Array], first: i
     return {"t": t[: t.size - first], "f": force[first:], "x": place[first:]}
 
 
-@pytest.mark.parametrize(("late", "noise_m", "first"), [(5, 2e-4, 300), (5, 1e-5, 300), (2, 2e-4, 300), (5, 2e-4, 0)])
+@pytest.mark.parametrize(
+    ("late", "noise_m", "first"),
+    [(5, 2e-4, 300), pytest.param(5, 1e-5, 300, marks=pytest.mark.long), (2, 2e-4, 300), (5, 2e-4, 0)],
+)
 def test_a_delay_of_the_force_is_found(late: int, noise_m: float, first: int) -> None:
     """Cut from motion: a speed that was held to four standard deviations of the first readings could not take up the input
     before them. From rest: the trial ended at 37 ms, held back by the states that belong to no delay.

@@ -58,7 +58,7 @@ def linear(hold: str) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [nominal, linear])
+@pytest.mark.parametrize("kind", [nominal, pytest.param(linear, marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("true", "stated", "delay_s", "found"),
     [

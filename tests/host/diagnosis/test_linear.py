@@ -314,7 +314,7 @@ def cut_from_motion(seed: int) -> dict[str, Array]:
     return {"t": DT_S * np.arange(1500), "r": r[400:], "y": y[400:]}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_controller_begins_with_a_state_of_its_own_and_works_continuously() -> None:
     """The integrator was begun at zero, and a loop that is integrated was simulated once a sample: a resonance, 0.92."""
     content = sd.diagnose([cut_from_motion(seed) for seed in (1, 2)], WITH_INTEGRATOR).as_dict()

@@ -43,7 +43,7 @@ def logged(samples: float, delay_s: float = 0.0) -> list[dict[str, Any]]:
     return made
 
 
-@pytest.mark.parametrize("samples", [4, pytest.param(3.3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("samples", [4, pytest.param(3.3, marks=pytest.mark.long)])
 def test_a_reading_that_is_logged_again_and_again_is_no_lag(samples: float) -> None:
     """A lag was named (0.29) that left two thirds of the error."""
     verdict = sd.diagnose(logged(samples), STAGE)

@@ -77,7 +77,7 @@ def test_a_gap_behind_dry_friction() -> None:
     assert verdict["fit"]["rmse_after"] < 0.2 * verdict["fit"]["rmse_before"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_gap_behind_friction_that_grows_with_the_load() -> None:
     verdict, effects = named(wound_up(GAP, 1.0, 0.25))
     assert set(effects) == {"backlash", "load_dependent_friction"} and verdict["verdict"] == "missing_physics"
