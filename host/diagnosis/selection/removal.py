@@ -16,7 +16,7 @@ from host.diagnosis.selection.folds import unexcited
 from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.refits import fit_nominal, fit_without, refined, restarted
 from host.diagnosis.selection.screening import term_of, without
-from host.diagnosis.selection.trial import Trial, at_bound, related, richer_gain, same_place, vanished
+from host.diagnosis.selection.trial import Trial, at_bound, contained, richer_gain, same_place, vanished
 
 
 def prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
@@ -100,16 +100,11 @@ def _in_its_place(problem: Problem, best: Fit, term: Term, trial: Trial, earned:
     other = restarted(problem, finish(problem, begun_again(problem, other)), simple.candidate)
     ahead = problem.gain("both", other.residuals, best.residuals)
     more = best.fitted - other.fitted
-    contained = _contained(trial, term)
-    most = richer_gain(earned, more, problem.rules) if contained else problem.rules.parameter_penalty * more
+    shape = contained(trial.candidate, term.candidate)
+    most = richer_gain(earned, more, problem.rules) if shape else problem.rules.parameter_penalty * more
     end = _Simpler(trial, other, get_starts(problem))
     set_starts(problem, begun)
     return end if ahead.log_likelihood < most and not at_bound(other) else None
-
-
-def _contained(trial: Trial, term: Term) -> bool:
-    own = term.candidate
-    return trial.candidate.effect.id in own.effect.contains and related(trial.candidate, own)
 
 
 def _simpler(found: Found, term: Term, others: int) -> list[Trial]:
@@ -123,8 +118,8 @@ def _simpler(found: Found, term: Term, others: int) -> list[Trial]:
             key, fewer = trial.candidate.key, trial.fit.terms[-1].fitted < term.fitted
             if fewer and same_place(trial.candidate, term.candidate) and key not in active and not trial.replaced:
                 kept.setdefault(key, trial)
-    shapes = [trial for trial in kept.values() if _contained(trial, term)]
-    rest = [trial for trial in kept.values() if not _contained(trial, term)]
+    shapes = [trial for trial in kept.values() if contained(trial.candidate, term.candidate)]
+    rest = [trial for trial in kept.values() if not contained(trial.candidate, term.candidate)]
     rest.sort(key=lambda trial: -trial.both.log_likelihood)
     return sorted([*shapes, *rest[:others]], key=lambda trial: trial.fit.terms[-1].fitted)
 

@@ -34,6 +34,7 @@ from host.diagnosis.selection.trial import (
     Trial,
     at_bound,
     called_for,
+    contained,
     good_enough,
     only_sampling,
     rank,
@@ -174,7 +175,7 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
         item
         for item in ranked
         if item.candidate.key not in fitted
-        and any(item.candidate.effect.id in c.effect.contains and related(item.candidate, c) for c in richer)
+        and any(contained(item.candidate, c) for c in richer)
         and item.promise > problem.rules.screening_log_likelihood
     ]
     if not missing:

@@ -220,6 +220,11 @@ def related(simple: Candidate, general: Candidate) -> bool:
     return same_place(simple, general) and (a.id == b.id or a.id in b.contains or bool(a.family and a.family == b.family))
 
 
+def contained(simple: Candidate, general: Candidate) -> bool:
+    """Whether `simple` is a shape that the effect `general` contains, at the same place."""
+    return simple.effect.id in general.effect.contains and related(simple, general)
+
+
 def wider(general: Candidate, bounded: Candidate) -> bool:
     """Whether `general` may fit where `bounded` ended at a bound of its form: another form of it, or one that holds it."""
     a, b = bounded.effect, general.effect

@@ -39,6 +39,16 @@ def axis(
     )
 
 
+def test_a_linear_axis_runs_by_one_matrix_as_it_does_step_by_step() -> None:
+    """A friction of no size takes the general way."""
+    u = np.random.default_rng(4).normal(size=400)
+    slots, begin = {"viscous": 0.3, "constant": 0.1}, (0.1, 0.2)
+    by_matrix, by_steps = (
+        axis(u, 0.01, [0.5, 3.0, 30.0, 0.2], {**slots, "coulomb": friction}, begin) for friction in (0.0, 1e-300)
+    )
+    np.testing.assert_allclose(by_matrix, by_steps, rtol=0.0, atol=1e-12)
+
+
 def test_cubic_oscillator_matches_an_adaptive_integrator() -> None:
     dt, t = 0.005, np.arange(0, 4, 0.005)
     u = np.sin(3 * t) + 0.4 * np.sin(7.3 * t)
