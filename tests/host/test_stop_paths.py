@@ -251,6 +251,7 @@ def stop_command(fleet: Fleet, path: Path) -> tuple[int, dict[str, dict[str, obj
 @pytest.mark.slow
 @pytest.mark.parametrize("trouble", ["none", "host killed", "host stalled", "realtime stalled", "realtime killed"])
 def test_the_command_stops_a_rig_in_contact(trouble: str, tmp_path: Path) -> None:
+    """The force is asserted in virtual time (`tests/sim/test_scenario.py`): here the wall beats while the machine stalls."""
     settings = DemoSettings(board="native", directory=tmp_path, estimator="tests.host.no_estimator:make")
     with Fleet(settings, tmp_path / "stop.mcap") as fleet:
         operator = Operator(fleet)
@@ -275,4 +276,3 @@ def test_the_command_stops_a_rig_in_contact(trouble: str, tmp_path: Path) -> Non
             assert status == (0 if any(answer["confirmed"] for answer in answers.values()) else 1)
         if victim == "host":
             assert not answers["zenoh"]["answered"]
-    assert fleet.rig_summary["peak_force_N"] < 0.55

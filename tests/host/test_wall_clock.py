@@ -1,6 +1,7 @@
 """The processes of the rig on the wall clock, one of them killed in contact: the stages rest, the recording reads back.
 
-Times that are asserted are the simulated board's own; the wall clock is only waited for.
+Times that are asserted are the simulated board's own; the wall clock is only waited for. The force is asserted in virtual
+time (`tests/sim/test_scenario.py`): here the wall beats on while the machine stalls.
 """
 
 import os
@@ -34,10 +35,8 @@ def test_killing_a_process_in_contact(victim: str, tmp_path: Path) -> None:
         others = set(fleet.processes) - {victim}
         assert fleet.dead() == [victim], f"{others} must live on"
         operator.session.close()
-    if victim != "rig":
-        summary = fleet.rig_summary
-        assert summary["peak_force_N"] < 0.55
     if victim == "realtime":
+        summary = fleet.rig_summary
         assert summary["last_edge_s"] - summary["last_byte_s"] <= 0.100
     read = RecordingFile(recording)
     assert read.topics["state"] > 0 and len(read.table("pose/tip")["x_m"]) > 0

@@ -19,6 +19,7 @@ from tests.realtime.conftest import RIG_FILE
 
 TARGET = ContactJob(target_m=(0.0, -0.0107, 0.025), hold_s=3.0)
 HERE = Path(__file__).parents[2]
+PEAK_N = 0.55
 
 
 def scenario(board: SimulatedBoard, seed: int = 1, heard: dict[str, list[Message]] | None = None) -> Scenario:
@@ -107,6 +108,18 @@ def test_without_the_computer_the_stages_rest_within_100_ms(board: SimulatedBoar
     run = scenario(board)
     in_contact(run)
     assert rest_after(run, 0.5) <= 0.100
+    assert run.world.peak_force_N < PEAK_N
+
+
+@pytest.mark.parametrize("stall_s", [0.0, 0.05, 0.3, 2.0])
+def test_a_stop_in_contact_keeps_the_force_small_whatever_the_computer_missed(board: SimulatedBoard, stall_s: float) -> None:
+    run = scenario(board)
+    in_contact(run)
+    rest_after(run, stall_s)
+    assert run.command("stop").accepted
+    run.run(3.0)
+    assert rest_after(run, 0.3) == 0.0
+    assert run.world.peak_force_N < PEAK_N
 
 
 def test_a_reset_board_stops_the_loop_until_an_operator_clears_it(board: SimulatedBoard) -> None:
