@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
 from host.diagnosis.model.operators import dahl
 
 
@@ -18,7 +20,16 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Kinetic force, excess of the static force, the Stribeck speed, and the distance over which the bristles yield."""
+    """Kinetic force, excess of the static force, the Stribeck speed, and the distance over which the bristles yield; second
+    form: kinetic force, half of the static one, and the Stribeck speed.
+    """
+    if form == "double":
+        # Beyond the recorded speeds, its fall is one of the damping.
+        tried = spread(0.1 * s.speed, 0.7 * s.speed, 3)
+        return (
+            Parameter("kinetic_force", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
+            Parameter("speed", f"{s.motion_unit}/s", tried, 0.05 * s.speed, s.speed, log=True),
+        )
     return (
         Parameter("kinetic_force", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
         Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
@@ -45,9 +56,25 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 def slots(p: Array, form: str) -> dict[str, float]:
     """Kinetic level, static excess, Stribeck speed, and the bristles' distance."""
+    if form == "double":
+        return {"coulomb": p[0], "static_excess": p[0], "stribeck_speed": p[1]}
     return {"coulomb": p[0], "static_excess": p[1], "stribeck_speed": p[2], "stribeck_distance": p[3]}
 
 
+_FORCE = Effect(
+    "stribeck_friction",
+    "force",
+    13,
+    force,
+    "Friction falls with speed: it is {kinetic_force} above a speed of {speed}, and {static_excess} more at rest.",
+    "F = (kinetic + static_excess*exp(-(v/speed)^2))*z,  dz = (1 - z*sign(dx))*dx/distance",
+    slots=slots,
+    timed=True,
+    contains=("coulomb_friction", "presliding_friction"),
+    family="dry",
+    remembers=True,
+    dissipates=True,
+)
 EFFECTS = (
     Effect(
         "stribeck_friction",
@@ -63,18 +90,15 @@ EFFECTS = (
         remembers=True,
         dissipates=True,
     ),
-    Effect(
-        "stribeck_friction",
-        "force",
-        13,
-        force,
-        "Friction falls with speed: it is {kinetic_force} above a speed of {speed}, and {static_excess} more at rest.",
-        "F = (kinetic + static_excess*exp(-(v/speed)^2))*z,  dz = (1 - z*sign(dx))*dx/distance",
-        slots=slots,
-        timed=True,
-        contains=("coulomb_friction", "presliding_friction"),
-        family="dry",
-        remembers=True,
-        dissipates=True,
+    _FORCE,
+    # Twice the friction at rest is plainly another law than Coulomb friction: this form does not contain it.
+    replace(
+        in_form(
+            _FORCE,
+            "double",
+            "Friction falls with speed: it is {kinetic_force} above a speed of {speed}, and twice as much at rest.",
+            "F = kinetic*(1 + exp(-(v/speed)^2))*sign(v)",
+        ),
+        contains=(),
     ),
 )

@@ -25,7 +25,7 @@ from host.diagnosis.model.model import (
     tolerance_of,
 )
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import calm, fill, reading_noise, smooth_derivatives, wander_at_rest
+from host.diagnosis.model.operators import fill, reading_noise, smooth_derivatives, smoothed, wander_at_rest
 from host.diagnosis.models import balance
 from protocol.errors import InputError
 
@@ -170,7 +170,7 @@ class AxisModel(Model):
             segment.y = np.zeros_like(y)
             seen = np.isfinite(recording.channels[spec.output]) & np.isfinite(recording.channels[spec.input])
             recorded = segment.inputs[spec.input]
-            segment.force_noise = recorded - calm(recorded, reading_noise(recorded), 1.0)
+            segment.force_noise = recorded - smoothed(recorded, reading_noise(recorded))
             segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
             segment.rests = balance.at_rest(x, segment.tolerances[name], segment.balance.support.size // 2)
             segment.spread, segment.read_motion = segment.balance.support.size // 2, recording.channels[spec.output]

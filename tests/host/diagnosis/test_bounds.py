@@ -104,6 +104,36 @@ def test_friction_that_grows_with_speed_is_not_named_stribeck(sign: float) -> No
     assert ids and ids[0] in ("coulomb_friction", "presliding_friction") and "stribeck_friction" not in ids
 
 
+def falling(number: int, kinetic_N: float, excess_N: float, noise_N: float) -> dict[str, Any]:
+    """Force of a press whose friction falls with the square of speed (Lorentz' curve; the library's form is Gauss')."""
+    rng, t = np.random.default_rng([83, number]), 0.01 * np.arange(1200)
+    turn, phase = 2.0 * np.pi * rng.uniform(0.1, 1.0, 4), rng.uniform(0.0, 6.28, 4)
+    x, v = 0.01 * np.sin(np.outer(t, turn) + phase).sum(axis=1), 0.01 * np.cos(np.outer(t, turn) + phase) @ turn
+    usual = np.std(v)
+    level = kinetic_N + excess_N / (1.0 + (v / (0.15 * usual)) ** 2)
+    force = 20.0 * v + 300.0 * x + level * np.tanh(v / (1e-3 * usual))
+    return {"t": t, "x": x, "f": force + noise_N * rng.standard_normal(t.size)}
+
+
+@pytest.mark.parametrize(
+    ("kinetic_N", "excess_N", "noise_N", "names"),
+    [
+        (0.05, 0.1, 0.02, ["stribeck_friction"]),
+        (0.05, 0.1, 0.1, ["stribeck_friction", "coulomb_friction"]),
+        (0.1, 0.0, 0.02, ["coulomb_friction"]),
+        (0.1, 0.0, 0.1, ["coulomb_friction"]),
+    ],
+)
+def test_friction_that_falls_with_speed_is_named_or_listed(
+    kinetic_N: float, excess_N: float, noise_N: float, names: list[str]
+) -> None:
+    """With 0.1 N of noise Coulomb friction was named with 0.94, and nothing listed."""
+    (effect,) = sd.diagnose([falling(k, kinetic_N, excess_N, noise_N) for k in (1, 2, 3)], PRESS).effects
+    listed = effect["indistinguishable_from"]
+    assert isinstance(listed, list)
+    assert [effect["id"], *(str(name).partition("@")[0] for name in listed)] == names
+
+
 def test_several_effects_of_one_name_may_leave_together(monkeypatch: pytest.MonkeyPatch) -> None:
     parts = [(Parameter("jump", "N", (size,)),) for size in (1.0, 2.0, 3.0)]
     first, second, other = (Term(one("coulomb_friction"), part) for part in parts)

@@ -119,6 +119,18 @@ def test_calm_takes_noise_out_and_keeps_a_step() -> None:
     assert np.max(np.abs(out - clean)[320:]) < 0.05
 
 
+@pytest.mark.parametrize("sigma", [0.0, 1e-5, 0.05])
+def test_smoothing_takes_noise_and_no_motion(sigma: float) -> None:
+    k = np.arange(600)
+    clean = np.sin(2.0 * np.pi * k / 25.0) + np.where(k > 300, 3.0, 0.0)
+    noise = sigma * np.random.default_rng(0).standard_normal(600)
+    off = op.smoothed(clean + noise, sigma) - clean
+    assert np.std(off) <= 1.05 * sigma
+    off, bend = off[20:280], np.gradient(np.gradient(clean))[20:280]
+    along = abs(off @ bend) / np.sqrt(bend @ bend * off.size)
+    assert along <= 0.6 * sigma  # `calm` is off by four times as much
+
+
 def test_fill_bridges_missing_samples() -> None:
     assert op.fill(np.array([np.nan, 1.0, np.nan, 3.0])).tolist() == [1.0, 1.0, 2.0, 3.0]
     assert op.fill(np.full(3, np.nan)).tolist() == [0.0, 0.0, 0.0]
