@@ -25,7 +25,7 @@ from host.diagnosis.model.model import (
     tolerance_of,
 )
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import fill, reading_noise, smooth_derivatives, smoothed, wander_at_rest
+from host.diagnosis.model.operators import calm, fill, reading_noise, smooth_derivatives, smoothed, wander_at_rest
 from host.diagnosis.models import balance
 from protocol.errors import InputError
 
@@ -48,7 +48,8 @@ class AxisSegment(Segment):
     substeps: int = 1  # of the integration, in one period
     stages: Array | None = None  # (n, substeps, 3) recorded input at the stages of Runge-Kutta
     balance: balance.Balance | None = None
-    force_noise: Array | None = None  # (n,) of the recorded force, where it is what is compared
+    force_noise: Array | None = None  # (n,) of the recorded force, where it is what is compared: its distance from means,
+    fine_force_noise: Array | None = None  # (n,) and from parabolas, which follow its bends
     rests: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (n,) where the axis is at rest
 
 
@@ -170,7 +171,9 @@ class AxisModel(Model):
             segment.y = np.zeros_like(y)
             seen = np.isfinite(recording.channels[spec.output]) & np.isfinite(recording.channels[spec.input])
             recorded = segment.inputs[spec.input]
-            segment.force_noise = recorded - smoothed(recorded, reading_noise(recorded))
+            level = reading_noise(recorded)
+            segment.force_noise = recorded - calm(recorded, level, 1.0)
+            segment.fine_force_noise = recorded - smoothed(recorded, level)
             segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
             segment.rests = balance.at_rest(x, segment.tolerances[name], segment.balance.support.size // 2)
             segment.spread, segment.read_motion = segment.balance.support.size // 2, recording.channels[spec.output]
@@ -267,7 +270,10 @@ class AxisModel(Model):
         drive = [effect for effect in active if effect[0].port.name == place]
         late = self.hold == "zero" and any(candidate.effect.shifts == "time" for candidate, _ in drive)
         finer = FINER * segment.substeps if late else 1  # a held input that is late by a part of a sample jumps within it
-        noise = segment.force_noise if drive else None  # the force sensor is not a part of the drive: no effect smooths it
+        # The force sensor is not a part of the drive: no effect smooths its noise. What a drive remembers takes the bends of
+        # the force with it. To laws without memory the means stay: see docs/history/diagnosis.md.
+        remembers = any(candidate.effect.remembers or candidate.effect.shifts for candidate, _ in drive)
+        noise = (segment.fine_force_noise if remembers else segment.force_noise) if drive else None
         true = recorded if noise is None else recorded - noise
         force = apply_effects(np.repeat(true, finer) if late else true, drive, place, segment, None, finer=finer)
         if noise is not None:
