@@ -479,7 +479,7 @@ def calm(x: Array, sigma: float, correlation: float, from_zero: bool = False) ->
 
 @njit(cache=True)
 def parabola(x: Array, i: int, half: int) -> tuple[float, float]:
-    """Value at sample i of the parabola through `half` samples to either side, and the variance that it keeps of white noise.
+    """Value at sample i of the parabola through `half` samples to either side, and how much of white variance it keeps.
 
     Weights: Savitzky and Golay, Analytical Chemistry 36 (1964) 1627.
     """
