@@ -55,7 +55,7 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Kinetic level, static excess, Stribeck speed, and the bristles' distance."""
+    """Kinetic level, static excess, Stribeck speed, and the bristles' distance; form `double` has none."""
     if form == "double":
         return {"coulomb": p[0], "static_excess": p[0], "stribeck_speed": p[1]}
     return {"coulomb": p[0], "static_excess": p[1], "stribeck_speed": p[2], "stribeck_distance": p[3]}
