@@ -34,7 +34,13 @@ def candidates(ports: tuple[Port, ...], timed: bool, left_out: frozenset[str] = 
                 or (effect.timed and not timed)
             ):
                 continue
-            sources = {"": ("",), "load": port.loads, "drag": port.drags or port.loads, "other": port.others}[effect.source]
+            sources = {
+                "": ("",),
+                "load": port.loads,
+                "drag": port.drags or port.loads,
+                "spring": port.springs,
+                "other": port.others,
+            }[effect.source]
             forms = [
                 form for form in effect.forms if not {f"{effect.id}:{form}", f"{effect.id}:{form}@{port.name}"} & left_out
             ]

@@ -50,6 +50,16 @@ EFFECTS = (
     ),
     Effect(
         "backlash",
+        "travel",
+        10,
+        parameters,
+        "After every reversal the force does not change until the motion has crossed a gap of {width}.",
+        "x = play(x, width/2)",
+        apply,
+        remembers=True,
+    ),
+    Effect(
+        "backlash",
         "deflection",
         10,
         crossed,

@@ -27,6 +27,13 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     return coefficient, rising(s) if form == "smooth" else replace(yielding(s, form, 5), vanishes=True)
 
 
+def by_spring(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """The same with the force of the spring, which is not recorded, and the force of which it is counted."""
+    span = s.source_span
+    zero = Parameter("zero", s.source_unit, (-0.4 * span, 0.0, 0.4 * span), -2.0 * span, 2.0 * span, step=0.01 * span)
+    return (*force(s, form), zero)
+
+
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Lost motion p[0] |load| times a friction state that builds up over p[1]."""
     level = p[0] * abs(float(c.load[0]))
@@ -60,6 +67,11 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"load_friction": p[0], "load_friction_distance": p[1]}
 
 
+def slots_of_spring(p: Array, form: str) -> dict[str, float]:
+    """The same, and the force from which the load is counted."""
+    return {**slots(p, form), "load_zero": p[2]}
+
+
 _CAPSTAN = Effect(
     "load_dependent_friction",
     "motion",
@@ -91,9 +103,20 @@ _RISING = in_form(
     "Friction grows with {source}: it is {coefficient} of its magnitude; below a speed of about {speed} it is smaller.",
     "F = coefficient*|load|*tanh(v/speed)",
 )
+_SPRING = replace(
+    _FORCE,
+    order=13,
+    parameters=by_spring,
+    says="Friction grows with the force of the spring, counted from {zero}: it is {coefficient} of its magnitude and builds "
+    "up over {distance}.",
+    equation="F = coefficient*|k x - zero|*z,  dz = (1 - z*sign(dx))*dx/distance",
+    slots=slots_of_spring,
+    source="spring",
+)
 EFFECTS = (
     _CAPSTAN,
     replace(_CAPSTAN, port="load"),
+    replace(_CAPSTAN, port="wrap", contains=(), family=""),
     Effect(
         "load_dependent_friction",
         "motion",
@@ -123,4 +146,17 @@ EFFECTS = (
     ),
     _FORCE,
     replace(_RISING, timed=True, remembers=False, rounded=True),
+    _SPRING,
+    replace(
+        in_form(
+            _SPRING,
+            "smooth",
+            "Friction grows with the force of the spring, counted from {zero}: it is {coefficient} of its magnitude; below "
+            "a speed of about {speed} it is smaller.",
+            "F = coefficient*|k x - zero|*tanh(v/speed)",
+        ),
+        timed=True,
+        remembers=False,
+        rounded=True,
+    ),
 )

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Evidence, Parameter, Scale, lines, spread
-from host.diagnosis.model.spectral_line import common_line, distorted, stands_out
+from host.diagnosis.model.spectral_line import common_line
 
 LEAST_PERIODS = 1.0  # in a recording: less of a sine cannot be separated from an offset, a ramp and a bend (Rayleigh)
 PERIODS = 2.0 / 3.0  # pitch against the span beyond which a bend is not a period: crest and trough have to come back
@@ -63,24 +63,17 @@ def of_a_line(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def on_the_line(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
     """The frequency of a line that stands out of the residual of every recording; no parameter where none does, or where
-    another signal has it too, recorded or simulated, or a law that distorts one would.
+    a law may have made it from another signal, recorded or simulated.
     """
     count = len(evidence.need)
     periods = [float(np.median(np.diff(time_s))) if time_s.size > 1 else 1.0 for time_s in evidence.time_s]
     laid = [_on_grid(t, x, dt) for t, x, dt in zip(evidence.time_s, evidence.need, periods, strict=True)]
-    line = common_line(laid, [()] * count, [np.zeros(x.size) for x in laid], periods)
     outputs = len(evidence.readings) // max(count, 1)
     known = [
         [*others, *(one.course for one in evidence.readings[k * outputs : (k + 1) * outputs])]
-        for k, others in enumerate(evidence.others)
+        for k, others in enumerate(evidence.others or [()] * count)
     ]
-    if line is not None and any(
-        stands_out(form, line.frequency_Hz, dt_s)
-        for signals, dt_s in zip(known, periods, strict=True)
-        for signal in signals
-        for form in distorted(signal)
-    ):
-        line = None
+    line = common_line(laid, known, [np.zeros(x.size) for x in laid], periods)
     (p,) = parameters
     return () if line is None else (replace(p, grid=(min(max(line.frequency_Hz, p.low), p.high),)),)
 

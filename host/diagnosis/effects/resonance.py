@@ -87,6 +87,20 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"second_mass": p[0], "second_omega": 2.0 * np.pi * p[1], "second_damping": p[2]}
 
 
+def added_mass(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """A mass on the measured motion, in the unit of the force per acceleration."""
+    return (
+        Parameter(
+            "mass", f"{s.unit} s2/{s.motion_unit}", (s.need / (s.speed**2 / s.motion_span),), 0.0, np.inf, linear=True
+        ),
+    )
+
+
+def slots_of_mass(p: Array, form: str) -> dict[str, float]:
+    """A force in proportion to the acceleration."""
+    return {"added_mass": p[0]}
+
+
 # Two masses on a spring k and damper d: the drive follows its force as the rigid pair does, times
 # 1 + ratio s^2 / (s^2 + 2 z w s + w^2), ratio = load / drive mass, w^2 = k (1/m1 + 1/m2) (Ellis, Control System Design
 # Guide, 2012, chapter 16).
@@ -151,5 +165,17 @@ EFFECTS = (
         slots=slots,
         filters=True,
         timed=True,
+    ),
+    Effect(
+        "resonance",
+        "inertia",
+        41,
+        added_mass,
+        "A mass of {mass} moves along.",
+        "F = mass*x''",
+        slots=slots_of_mass,
+        filters=True,
+        timed=True,
+        forms=("mass",),
     ),
 )

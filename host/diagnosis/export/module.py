@@ -98,7 +98,7 @@ def _law(model: Any, theta: Array, active: list[ActiveEffect], gathered: Gathere
         return _links(model, theta, gathered), "none"
     if isinstance(model, AxisModel) and model.free_run and model.spec.controller is None:
         return _axis(model, theta, active, gathered), "position and speed"
-    along = [c.key for c, _ in active if c.port.kind in ("force", "chain")]
+    along = [c.key for c, _ in active if {"force", "chain"} & set(c.port.kind.split("+"))]
     if along:
         wanted = "effects at inputs and outputs, or a parameter that the simulator offers ([[offer]])"
         raise InputError("--export", f"{along[0]}, a force along a motion", wanted)

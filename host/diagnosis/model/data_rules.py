@@ -90,3 +90,6 @@ class DataRules:
     # Lines in the spectrum of a residual.
     line_significance: float = 1e-4  # over all bins of all recordings
     line_variance_share: float = 0.05  # of the residual's variance that is in the line
+    line_gain: float = 10.0  # at a line over that elsewhere, of a filter between another signal and the residual
+    line_origin_share: float = 0.1  # of its share of the residual that a line has of the signal whose distortion made it
+    line_answer_spread: float = 0.4  # of the answers of one law to a line, between recordings, over their mean

@@ -62,6 +62,7 @@ class Scale:
     timed: bool
     source_unit: str = ""
     source_rms: float = 1.0
+    source_span: float = 1.0
     motion_unit: str = ""  # force ports: unit of the motion
     motion_span: float = 1.0
 
@@ -133,12 +134,12 @@ class Effect:
     """One effect at one kind of port.
 
     `port`: motion (a kinematic signal), turn (an angle), load (one that deflects the output), deflection (what it does),
-    force (a force balance), timing, clock, limit, drift and mix (a scalar reading),
-    or one of the rig's own ports. A `Port` is of one or several of these kinds, joined by `+`.
-    `source`: the further signal that it depends on: "load" (a force), "drag" (a force or bend that presses), "other"
-    (another channel). `order`: place among the effects of one port, small first. `side`: motion ports only, before or after
-    the nominal gain. `apply(signal, context, values, form)`: the changed signal. Force ports give `slots` for the force
-    kernel instead. `contains`: ids of which this one is a generalization (nested pairs).
+    force (a force balance), travel (the motion that a force balance is given), timing, clock, limit, drift, mix and wrap (a
+    scalar reading), or one of the rig's own ports. A `Port` is of one or several of these kinds, joined by `+`.
+    `source`: the further signal that it depends on: "load" (a force), "drag" (a force or bend that presses), "spring" (a
+    force of the law itself), "other" (another channel). `order`: place among the effects of one port, small first. `side`:
+    motion ports only, before or after the nominal gain. `apply(signal, context, values, form)`: the changed signal. Force
+    ports give `slots` for the force kernel instead. `contains`: ids of which this one is a generalization (nested pairs).
     """
 
     id: str
@@ -193,6 +194,7 @@ class Port:
     loads: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
     drags: tuple[str, ...] = ()
+    springs: tuple[str, ...] = ()  # forces of the law itself, which may press what rubs
     offers: tuple[Effect, ...] = ()  # parameters of a simulator that compete as effects, of this port alone
     held: bool = False  # an input that is held between samples: a delay within one sample is how it was held
     within: str = ""  # port of the link that this place along a loaded link belongs to: an equation acts there

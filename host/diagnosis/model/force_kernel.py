@@ -54,6 +54,8 @@ SLOTS = (
     "load_smooth",
     "load_smooth_speed",
     "constant",
+    "load_zero",
+    "added_mass",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -101,6 +103,8 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     LOAD_SMOOTH,
     LOAD_SMOOTH_SPEED,
     CONSTANT,
+    LOAD_ZERO,
+    ADDED_MASS,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
@@ -138,7 +142,7 @@ def _rising(v: float, load: float, p: Array) -> float:
     """Friction at speed v of the laws that rise with speed, one of which follows the load; nothing where there is none."""
     force = p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
     if p[LOAD_SMOOTH_SPEED] > 0.0:
-        force += p[LOAD_SMOOTH] * abs(load) * math.tanh(v / p[LOAD_SMOOTH_SPEED])
+        force += p[LOAD_SMOOTH] * abs(load - p[LOAD_ZERO]) * math.tanh(v / p[LOAD_SMOOTH_SPEED])
     return force
 
 
@@ -174,7 +178,7 @@ def _slowed(v_free: float, lost: float, rise: float) -> float:
 def _slowed_by_rising(v_free: float, load: float, h_over_m: float, p: Array) -> float:
     """Speed after the laws that rise with speed (`_rising`) have acted over one step, one after the other."""
     v = _slowed(v_free, h_over_m * p[SMOOTH], p[SMOOTH_SPEED])
-    return _slowed(v, h_over_m * p[LOAD_SMOOTH] * abs(load), p[LOAD_SMOOTH_SPEED])
+    return _slowed(v, h_over_m * p[LOAD_SMOOTH] * abs(load - p[LOAD_ZERO]), p[LOAD_SMOOTH_SPEED])
 
 
 @njit(cache=True)
@@ -196,7 +200,7 @@ def hysteresis(z: Array, dx: float, v: float, load: float, p: Array) -> float:
             force += p[PRESLIDING] * z[0]
     if p[LOAD] != 0.0:
         z[4] = side + (z[4] - side) * math.exp(-abs(dx) / p[LOAD_DISTANCE])
-        force += p[LOAD] * abs(load) * z[4]
+        force += p[LOAD] * abs(load - p[LOAD_ZERO]) * z[4]
     if p[STRIBECK_D] > 0.0:
         z[5] = side + (z[5] - side) * math.exp(-abs(dx) / p[STRIBECK_D])
         force += level_at(v, p) * z[5]
@@ -208,7 +212,7 @@ def start_state(z: Array, start: float, load: float, p: Array) -> float:
     """Friction states such that together they hold `start` at the first sample, as far as they can; returns Coulomb's
     share. A branch that relaxes holds what friction cannot (`relaxed_by`).
     """
-    level = p[COULOMB] + p[EXCESS] + p[PRESLIDING] + p[LOAD] * abs(load)
+    level = p[COULOMB] + p[EXCESS] + p[PRESLIDING] + p[LOAD] * abs(load - p[LOAD_ZERO])
     share = min(max(start / level, -1.0), 1.0) if level != 0.0 else 0.0
     z[:] = share
     return share
@@ -281,7 +285,7 @@ def along(
         dx = x[i] - x[i - 1] if i > 0 else 0.0
         slow = x[i] + (slow - x[i]) * decay
         out[i] = smooth_force(x[i], v[i], t[i], slow, p) + hysteresis(z, dx, v[i], load[i], p)
-        out[i] += _rising(v[i], load[i], p)
+        out[i] += _rising(v[i], load[i], p) + p[ADDED_MASS] * a[i]
         if dry and p[STRIBECK_D] <= 0.0:
             out[i] += level_at(v[i], p) * (side[i] if side[i] != 0.0 else rest)
         if p[MASS2] > 0.0:

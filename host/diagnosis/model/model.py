@@ -292,6 +292,7 @@ def scale_of(model: Model, segments: list[Segment], port: Port, candidate: Candi
         timed=used[0].recording.timed,
         source_unit=units.get(candidate.source, used[0].units.get(candidate.source, "")) or "1",
         source_rms=float(np.sqrt(np.mean(source**2))) or 1.0,
+        source_span=float(np.ptp(source)) or 1.0,
         motion_unit=used[0].units.get(f"motion:{port.name}", unit),
         motion_span=span,
     )

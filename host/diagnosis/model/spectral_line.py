@@ -3,8 +3,11 @@
 A sine over time with one phase for all recordings is a candidate effect. If each recording starts at another instant of
 the disturbance, no such sine fits, and an autoregression predicts a sine as it predicts noise. The line itself shows in
 every periodogram, against the level of the bins around it. A frequency at which the simulated output moves more says
-nothing: the residual rings there if a parameter or a start of the nominal model is a little off. Where a square, a
-cube or a magnitude of it has a line too, a nonlinear law may have made the one from the other.
+nothing: the residual rings there if a parameter or a start of the nominal model is a little off. Where another signal, or
+its square, cube or magnitude, has a line there too, a law may have made the one from the other; but then the rest of
+that signal is in the residual as well, and the law answers alike in all recordings. A line that has nearly all of the
+residual does not come from a signal of which it has next to nothing, nor one of another phase in each recording from one
+that has it in phase.
 """
 
 from __future__ import annotations
@@ -39,26 +42,30 @@ def common_line(
     periods_s: Sequence[float],
     rules: DataRules = DataRules(),
 ) -> Tone | None:
-    """The line at one frequency in all residuals (n_i,) that no input (n_i,) of its recording has; None if there is none.
+    """The line at one frequency in all residuals (n_i,) that no law makes of one of the inputs; None if there is none.
 
     simulated: output (n_i,) of each recording; it moves less than the residual at that frequency. rules: an effect that
     reads its start values from a residual uses the defaults.
     """
     if not residuals or min(int(np.isfinite(r).sum()) for r in residuals) < FEWEST:
         return None
-    count = sum(r.size // 2 for r in residuals)
-    found = []
+    limit = np.log(sum(r.size // 2 for r in residuals) / rules.line_significance)
+    found, makers = [], []  # makers: of each recording, for each input and law, what the law would have to answer
     for r, own, said, dt_s in zip(residuals, inputs, simulated, periods_s, strict=True):
         x = fill(r)
         over = _over_level(x)
         bin_ = int(np.argmax(over))
-        limit = np.log(count / rules.line_significance)
-        if over[bin_] < limit or any(np.max(_over_level(fill(u))[max(bin_ - 1, 0) : bin_ + 2]) > limit for u in own):
+        if over[bin_] < limit:
             return None
         near = slice(max(bin_ - 2, 0), bin_ + 3)
         if np.sum(_periodogram(fill(said))[near]) > np.sum(_periodogram(x)[near]):
             return None
-        found.append(_sine(x, bin_, dt_s))
+        tone = _sine(x, bin_, dt_s)
+        makers.append([_laws(fill(u), x, tone, dt_s, limit, rules) for u in own])
+        found.append(tone)
+    answers = np.array(makers).reshape(len(makers), -1).T  # (inputs * laws, recordings)
+    if any(_one_law(each, rules) for each in answers):
+        return None
     hertz = np.array([each.frequency_Hz for each in found])
     widest = max(1.0 / (r.size * dt_s) for r, dt_s in zip(residuals, periods_s, strict=True))
     amplitude = float(np.sqrt(np.mean([each.amplitude**2 for each in found])))
@@ -66,12 +73,42 @@ def common_line(
     return Tone(float(np.mean(hertz)), amplitude) if np.ptp(hertz) < widest and share > rules.line_variance_share else None
 
 
-def stands_out(x: Array, frequency_Hz: float, dt_s: float, rules: DataRules = DataRules()) -> bool:
-    """Whether the spectrum of `x` (n,) has a line at `frequency_Hz`."""
-    bin_ = round(frequency_Hz * x.size * dt_s)
-    near = _over_level(x)[max(bin_ - 1, 0) : bin_ + 2]
-    limit = float(np.log(x.size / 2 / rules.line_significance))
-    return x.size >= FEWEST and near.size > 0 and float(np.max(near)) > limit
+def _laws(u: Array, x: Array, tone: Tone, dt_s: float, limit: float, rules: DataRules) -> list[complex]:
+    """What each law of `distorted` would have to answer to the signal `u` (n,) at the line `tone` of the residual `x` (n,).
+
+    NaN where it cannot have made the line; infinite where it may have, whatever it answers: `u` is such a line itself. A
+    filter raises its gain at the line above that elsewhere by `rules.line_gain` at most. A distortion leaves the other parts
+    of the distorted signal in the residual too, but for what the nominal model takes: the signal and its rate.
+    """
+    bin_ = round(tone.frequency_Hz * u.size * dt_s)
+    near = slice(max(bin_ - 1, 0), bin_ + 2)
+    centred, *forms = distorted(u)
+    taken = np.column_stack([np.ones(u.size), centred, np.gradient(centred)])
+    left = [form - taken @ np.linalg.lstsq(taken, form, rcond=None)[0] for form in forms]
+    share = 0.5 * tone.amplitude**2 / float(np.var(x))
+    least = [share / rules.line_gain**2, *(share * rules.line_origin_share for _ in forms)]
+    per_sample = tone.frequency_Hz * dt_s
+    answers = []
+    for form, rest, lowest in zip([centred, *forms], [centred, *left], least, strict=True):
+        part, variance = _component(rest, per_sample), float(np.var(rest))
+        made = np.max(_over_level(form)[near], initial=0.0) > limit and 0.5 * abs(part) ** 2 > lowest * variance
+        answers.append(_component(x, per_sample) / part if made and part != 0.0 else complex(np.nan))
+    itself = 0.5 * abs(_component(centred, per_sample)) ** 2 > rules.line_origin_share * share * float(np.var(centred))
+    return [complex(np.inf) if itself and np.isfinite(answers[0]) else answers[0], *answers[1:]]
+
+
+def _one_law(answers: npt.NDArray[np.complex128], rules: DataRules) -> bool:
+    """Whether `answers` (recordings,) are those of one law: alike in size and phase, where they matter."""
+    asked = answers[~np.isinf(answers)]
+    mean = complex(np.mean(asked)) if asked.size else 0.0
+    return not np.isnan(answers).any() and bool(np.all(np.abs(asked - mean) <= rules.line_answer_spread * abs(mean)))
+
+
+def _component(x: Array, per_sample: float) -> complex:
+    """Complex amplitude of the sine of `per_sample` periods a sample in `x` (n,)."""
+    window = np.hanning(x.size)
+    turns = np.exp(-2j * np.pi * per_sample * np.arange(x.size))
+    return complex(2.0 * np.sum(window * turns * (x - np.mean(x))) / np.sum(window))
 
 
 def distorted(x: Array) -> list[Array]:

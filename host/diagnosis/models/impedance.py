@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from host.diagnosis.model.model import (
     stack,
 )
 from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.model.operators import fill
 from host.diagnosis.models.moved import Moved, force_along
 
 Array = npt.NDArray[np.float64]
@@ -52,9 +53,12 @@ class ImpedanceModel(Model):
         force, motion, name = self.units[self.spec.output], self.units[self.spec.input], self.spec.subsystem
         self.outputs = (Output(self.spec.output, force, name),)
         loads, others = tuple(self.spec.load), tuple(self.spec.others)
+        balance = "force" if "mass" in self.spec.terms else "force+inertia"
+        pressing = loads or forces_among(others, self.units)
         self.ports = (
-            Port(name, "force", name, (self.spec.output,), loads or forces_among(others, self.units), others),
-            Port(f"{name}_reading", "drift+timing+limit+mix", name, (self.spec.output,), (), others),
+            Port(name, balance, name, (self.spec.output,), pressing, others, springs=() if pressing else self._springs()),
+            Port(f"{name}_motion", "travel", name, (self.spec.output,)),
+            Port(f"{name}_reading", "drift+timing+limit+mix+wrap", name, (self.spec.output,), (), others),
         )
         unit = {
             "mass": f"{force} s2/{motion}",
@@ -74,15 +78,18 @@ class ImpedanceModel(Model):
                 parameters.append(Parameter(key, text, (value,), *bounds, linear=True))
                 self.terms.append((term, source))
         self.parameters = tuple(parameters)
-        have = {"damping": "viscous_friction:", "mass": "added_mass"}
         # A constant force is an offset of the reading of force.
-        self.taken = frozenset(("gravity_load:constant", *(have[term] for term in self.spec.terms if term in have)))
+        self.taken = frozenset(("gravity_load:constant", *(("viscous_friction:",) if "damping" in self.spec.terms else ())))
         if "stiffness" not in self.spec.terms:
             self.taken |= {"contact_nonlinear:", "softening:"}
         self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in (self.spec.input, *loads))
         self.unlisted_at = ((name, f"{name}_reading"),)
         self.moves = {name: self.spec.input}
         self.quiet_inputs = (self.spec.input, *loads)
+
+    def _springs(self) -> tuple[str, ...]:
+        """The force of the spring, which may press what rubs where no other force is recorded."""
+        return (f"{self.spec.subsystem}_spring",) if "stiffness" in self.spec.terms else ()
 
     def prepare(self, recording: Recording) -> MovedSegment:
         """Motion smoothed to velocity and acceleration without phase."""
@@ -96,9 +103,19 @@ class ImpedanceModel(Model):
         motion = segment.inputs[self.spec.input]
         segment.moved = Moved.of(motion, recording)
         segment.inputs[f"motion:{self.spec.subsystem}"] = motion
-        segment.tolerances[self.spec.subsystem] = segment.moved.tolerance
+        for port in (self.spec.subsystem, f"{self.spec.subsystem}_motion"):
+            segment.tolerances[port] = segment.moved.tolerance
         name, force, unit = self.spec.subsystem, self.units[self.spec.output], self.units[self.spec.input]
-        segment.units = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}
+        spring = f"{name}_spring"
+        segment.inputs[spring] = fill(segment.y[0])  # of its size; `simulate` has the force itself
+        segment.units = {
+            **self.units,
+            spring: force,
+            name: force,
+            f"motion:{name}": unit,
+            f"{name}_motion": unit,
+            f"{name}_reading": force,
+        }
         return segment
 
     def guess(self, segments: list[Segment]) -> Array:
@@ -109,7 +126,7 @@ class ImpedanceModel(Model):
         """Force along the measured motion. Shape (1, n)."""
         assert isinstance(segment, MovedSegment)
         force = np.zeros(segment.n)
-        moved = segment.moved
+        moved = self._handed_on(segment, active)
         given = {"mass": moved.a, "damping": moved.v, "stiffness": moved.x, "offset": 1.0}
         stiffness = 0.0
         for (term, source), value in zip(self.terms, theta, strict=True):
@@ -117,8 +134,18 @@ class ImpedanceModel(Model):
             stiffness = value if term == "stiffness" else stiffness
         port = self.spec.subsystem
         here = [effect for effect in active if effect[0].port.name == port]
-        force = force + force_along(segment.moved, here, segment, port, float(stiffness))
+        segment.inputs[f"{port}_spring"] = stiffness * moved.x
+        force = force + force_along(moved, here, segment, port, float(stiffness))
         return np.asarray(apply_effects(force, active, f"{self.spec.subsystem}_reading", segment, None))[None, :]
+
+    def _handed_on(self, segment: MovedSegment, active: list[ActiveEffect]) -> Moved:
+        """The motion behind the effects between where it is measured and where the force acts."""
+        place, moved = f"{self.spec.subsystem}_motion", segment.moved
+        if not any(candidate.port.name == place for candidate, _ in active):
+            return moved
+        x = apply_effects(moved.x, active, place, segment, None)
+        moves = np.diff(x, prepend=x[0]) != 0.0
+        return replace(moved, x=x, v=np.where(moves, moved.v, 0.0), a=np.where(moves, moved.a, 0.0))
 
     def noise_of_inputs(self, segment: Segment, theta: Array) -> Array:
         """Force (1,) that the noise of the motion makes through the law."""
@@ -129,10 +156,16 @@ class ImpedanceModel(Model):
 
     def motion(self, segment: Segment, port: Port) -> Array:
         """The measured motion, or the measured force for the reading port."""
-        if port.name == self.spec.subsystem:
+        if port.name in (self.spec.subsystem, f"{self.spec.subsystem}_motion"):
             return segment.inputs[self.spec.input]
         return np.where(np.isfinite(segment.y[0]), segment.y[0], np.nanmedian(segment.y[0]))
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
-        """The residual is a force already."""
-        return np.asarray(residual[0])
+        """The residual is a force already; a motion makes it through the stiffness or, without one, the damping."""
+        if port.name != f"{self.spec.subsystem}_motion":
+            return np.asarray(residual[0])
+        law = {term: abs(float(value)) for (term, _), value in zip(self.terms, theta, strict=True)}
+        assert isinstance(segment, MovedSegment)
+        moved = segment.moved
+        sizes = [law.get(term, 0.0) * float(np.std(x)) for term, x in (("stiffness", moved.x), ("damping", moved.v))]
+        return np.asarray(residual[0] * float(np.std(moved.x)) / max(*sizes, 1e-300))

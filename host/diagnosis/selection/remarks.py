@@ -10,7 +10,7 @@ from host.diagnosis.estimation.fit import Problem
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.findings import Finding
-from host.diagnosis.model.spectral_line import common_line, distorted
+from host.diagnosis.model.spectral_line import common_line
 from host.diagnosis.selection.full_rate import Figures, FullRate, rms
 
 Array = npt.NDArray[np.float64]
@@ -90,14 +90,14 @@ def lines_in_spectrum(full: Problem, fits: FullRate) -> list[Finding]:
     for row, output in enumerate(full.model.outputs):
         residuals = [r[row] for r in fits.nominal.residuals]
         simulated = [segment.y[row] - r for segment, r in zip(full.segments, residuals, strict=True)]
-        known = [[*own, *distorted(said)] for own, said in zip(inputs, simulated, strict=True)]
+        known = [[*own, said] for own, said in zip(inputs, simulated, strict=True)]
         line = common_line(residuals, known, simulated, periods, full.rules.data)
         if line is None:
             continue
         column = full.columns.get(output.channel, output.channel)
         says = f"The residual of column {column} has a sine of {line.frequency_Hz:.4g} Hz, amplitude {line.amplitude:.3g} "
         says += (
-            f"{output.unit}, in every recording. No input has this frequency, and the simulated output hardly moves at it: "
+            f"{output.unit}, in every recording. No law makes it of an input, and the simulated output hardly moves at it: "
         )
         says += "a hum, a vibration or a rotating part is not in the nominal model."
         findings.append(Finding("line", column, says))

@@ -209,6 +209,20 @@ def test_a_broad_peak_and_a_tone_of_the_input_are_no_lines() -> None:
     )
 
 
+def test_a_line_is_not_from_an_input_that_hardly_has_it_nor_from_one_that_answers_otherwise() -> None:
+    """A trace of the frequency in a recorded force, or in its square, hid a disturbance of a third of the motion."""
+    rng = stream(61)
+    t = np.arange(0.0, 20.0, 0.01)
+    still = [np.zeros(t.size)] * 2
+    tone = [np.sin(2.0 * np.pi * 3.0 * t + phase) + 0.1 * rng.standard_normal(t.size) for phase in (0.0, 1.0)]
+    slow = 5.0 * np.sin(2.0 * np.pi * 0.3 * t)
+    assert common_line(tone, [[slow + 0.002 * np.sin(2.0 * np.pi * 3.0 * t)]] * 2, still, [0.01, 0.01]) is not None
+    half = np.sin(2.0 * np.pi * 1.5 * t)
+    assert common_line(tone, [[half]] * 2, still, [0.01, 0.01]) is not None  # its square has one phase, the line has two
+    in_phase = [-np.cos(2.0 * np.pi * 3.0 * t) + 0.1 * rng.standard_normal(t.size) for _ in range(2)]
+    assert common_line(in_phase, [[half]] * 2, still, [0.01, 0.01]) is None
+
+
 @pytest.mark.parametrize("swapped", [True, False])
 @pytest.mark.parametrize("damping", [15.0, 6.0])
 def test_exchanged_columns_are_found_by_stated_values_where_stamps_are_uneven(swapped: bool, damping: float) -> None:

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.signal import TransferFunction, lsim
 
+import host.diagnosis as sd
 from host.diagnosis.estimation import noise
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import diagnose
 from host.diagnosis.report.verdict import as_json
+from tests.host.proof.everyday import gear_nominal
 
 NOMINAL = """
 name = "belt drive"
@@ -75,3 +77,16 @@ def test_an_output_on_its_way_is_no_noise() -> None:
     y = lsim(TransferFunction([1.0], [0.5, 1.0]), step, t)[1] + 0.01 * rng.normal(size=t.size)
     found = noise.estimate([y], [noise.quiescent([step], 0.02, True)])
     assert found.sigma == pytest.approx(0.01, rel=0.3)
+
+
+def test_an_offset_behind_the_lost_sign_is_no_curve() -> None:
+    """A gear whose sensor gives |angle| and adds 0.05 rad was named an even polynomial with 0.94."""
+    recordings = []
+    for number in (1, 2):
+        rng = np.random.default_rng([6, number])
+        t = np.arange(0.0, 12.0, 0.01)
+        motor = np.sin(2.0 * np.pi * np.outer(t, [0.2, 0.5, 1.1]) + rng.uniform(0.0, 6.28, 3)).sum(axis=1)
+        recordings.append({"t": t, "motor": motor, "load": np.abs(0.4 * motor) + 0.05 + 2e-3 * rng.standard_normal(t.size)})
+    (found,) = sd.diagnose(recordings, gear_nominal()).effects
+    assert found["id"] == "rectified_sensor"
+    assert found["parameters"]["level_rad"]["value"] == pytest.approx(0.05, abs=1e-3)
