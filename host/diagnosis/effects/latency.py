@@ -11,10 +11,16 @@ LONGEST = 0.25  # of the recording
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Delay: causal, and no longer than leaves most of the recording to compare."""
+    """Delay: causal, and no longer than leaves most of the recording to compare.
+
+    At a held input the output may be up to one sample early: an integrator that moves the place with the speed of the end
+    of each step is. Such a lead is a matter of sampling and is not named.
+    """
     longest = LONGEST * s.duration_s
     delays = (0.05 * s.dt_s, 0.4 * s.dt_s, 2.0 * s.dt_s, *spread(6.0 * s.dt_s, max(0.5 * longest, 7.0 * s.dt_s), 7))
-    return (Parameter("delay", "s", delays, 0.0, longest, step=s.dt_s, dead_time=True),)
+    earliest = -s.dt_s if s.held else 0.0
+    leads = (-0.4 * s.dt_s, -0.05 * s.dt_s) if s.held else ()
+    return (Parameter("delay", "s", (*leads, *delays), earliest, longest, step=s.dt_s, dead_time=True),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

@@ -65,6 +65,7 @@ class Scale:
     source_span: float = 1.0
     motion_unit: str = ""  # force ports: unit of the motion
     motion_span: float = 1.0
+    held: bool = False  # the signal is an input that is held between samples
 
 
 @dataclass

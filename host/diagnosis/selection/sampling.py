@@ -74,11 +74,18 @@ def _late(problem: Problem, hold: str, candidates: Sequence[Candidate]) -> Fit:
 def late_by_a_sample(problem: Problem, late: Trial, past: bool = False) -> list[Finding]:
     """Say that a delay within one sample explains a mismatch and is not named. past: it was searched on with it."""
     period_s, port = problem.segments[0].recording.dt_s, late.candidate.port
-    says = f"A delay of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {late.both.share:.0%} "
+    early = any(
+        p.unit == "s" and value < 0.0
+        for p, value in zip(late.fit.terms[-1].parameters, late.fit.values_of(late.fit.terms[-1]), strict=True)
+    )
+    shift = "lead" if early else "delay"
+    says = (
+        f"A {shift} of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {late.both.share:.0%} "
+    )
     says += "of the squared error. No effect is named for it: these recordings cannot separate a delay or lag of this size "
     says += "from the way in which the input is held between samples, recorded or simulated. "
     says += (
-        "The diagnosis continues with this delay."
+        f"The diagnosis continues with this {shift}."
         if past
         else "Record at a higher rate, or shift that column by one sample."
     )

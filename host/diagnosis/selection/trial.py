@@ -175,16 +175,18 @@ def of_sampling(trial: Trial) -> bool:
     recorded, which is not physics: it is within a sample, and no time between those that this could take.
 
     An input that is held where it should run straight is half a sample late, one that is recorded after its sample a whole
-    one, and an integrator of a few steps in a sample a small part of one. A sensor that is read more seldom than it is
-    logged adds any part of a sample. A delay d that gains the log-likelihood L over none has about the standard deviation
-    d / sqrt(2 L), since L is a parabola in d.
+    one, and an integrator of a few steps in a sample a small part of one, or as early as that. A sensor that is read more
+    seldom than it is logged adds any part of a sample. A delay d that gains the log-likelihood L over none has about the
+    standard deviation d / sqrt(2 L), since L is a parabola in d.
     """
     shift, rules = trial.candidate.effect.shifts, trial.rules
     if not shift or not trial.candidate.port.held:
         return False
     longest_s = max(r.shape[1] for r in trial.fit.residuals) * trial.period_s
     term = trial.fit.terms[-1]
-    own = zip(term.parameters, trial.fit.values_of(term), strict=True)
+    own = list(zip(term.parameters, trial.fit.values_of(term), strict=True))
+    if any(p.unit == "s" and value < 0.0 for p, value in own):
+        return True
     late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
     late = late_s / trial.period_s
     if late > rules.sampling_delay or trial.seldom:
@@ -203,12 +205,13 @@ def within_sample(trials: list[Trial], base: Fit) -> Trial | None:
 def only_sampling(trial: Trial, trials: list[Trial]) -> bool:
     """Whether a delay within one sample does as well at the place of `trial`: how an input was held, under another name.
 
-    At another place of the same subsystem the delay has to do better: what it leaves to that place is less than noise.
+    At another place of the same subsystem another shift has to do better: what it leaves to that place is less than noise.
     """
     own, rules = trial.candidate.port, trial.rules
     for other in trials:
         port = other.candidate.port
-        least = trial.score - (rules.heldout_log_likelihood if port.name == own.name else 0.0)
+        same = port.name == own.name or other.candidate.effect.id == trial.candidate.effect.id
+        least = trial.score - (rules.heldout_log_likelihood if same else 0.0)
         if of_sampling(other) and port.subsystem == own.subsystem and other.score > least:
             return True
     return False
