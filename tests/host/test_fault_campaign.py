@@ -226,6 +226,7 @@ def broken(results: Sequence[RunResult]) -> list[object]:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_each_fault_breaks_no_rule() -> None:
     """Every fault once, a third of them in each phase; `make long` has more of them, the campaign all in all phases.
 

@@ -10,8 +10,16 @@ THESIS = {"law": "thesis", "form": "incremental", "position_integral_per_s2": 0.
 
 
 # With these goals an insertion next to a knob that straightens was once taken for a tracker that moved.
-@pytest.mark.parametrize("law", [{}, THESIS], ids=["predictive", "thesis"])
-@pytest.mark.parametrize("seed", [5, 101])
+@pytest.mark.parametrize(
+    ("law", "seed"),
+    [
+        pytest.param({}, 5, marks=pytest.mark.long),
+        ({}, 101),
+        (THESIS, 5),
+        pytest.param(THESIS, 101, marks=pytest.mark.long),
+    ],
+    ids=["predictive-5", "predictive-101", "thesis-5", "thesis-101"],
+)
 def test_goals_far_apart_are_reached_without_an_alarm(law: dict[str, object], seed: int) -> None:
     rig = with_control(load_rig(SIMULATED_RIG), **law)
     there = go_to(rig, random_goals(rig, 5, seed), seed, seconds=2.6, within_s=2.5)

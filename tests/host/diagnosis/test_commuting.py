@@ -123,7 +123,11 @@ def test_an_effect_joins_once_on_a_linear_path(active: str, further: str, taken:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("delay_s", "lag_s", "effect", "key"), [(0.08, 0.0, "latency", "delay_s"), (0.0, 0.08, "rate_lag", "time_constant_s")]
+    ("delay_s", "lag_s", "effect", "key"),
+    [
+        (0.08, 0.0, "latency", "delay_s"),
+        pytest.param(0.0, 0.08, "rate_lag", "time_constant_s", marks=pytest.mark.long),
+    ],
 )
 def test_a_delay_or_lag_is_named_once_with_its_whole_value(delay_s: float, lag_s: float, effect: str, key: str) -> None:
     verdict = sd.diagnose([motor(k, delay_s, lag_s) for k in (1, 2, 3)], MOTOR)
@@ -178,7 +182,7 @@ SLIDE: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("held", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_a_drifting_clock_has_a_place_where_the_masses_are_known(held: bool) -> None:
     """The reading comes faster. With free rates, an input that comes faster does the same: mass and damping change."""
     rng, t, faster = np.random.default_rng(68), np.arange(0.0, 20.0, 0.01), 1.005

@@ -357,7 +357,10 @@ def test_jumps_of_dry_friction_do_not_count_as_noise() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lag_s", "named"), [(0.004, {"saturation", "rate_lag"}), (0.005, {"saturation"})])
+@pytest.mark.parametrize(
+    ("lag_s", "named"),
+    [pytest.param(0.004, {"saturation", "rate_lag"}, marks=pytest.mark.long), (0.005, {"saturation"})],
+)
 def test_what_a_delay_within_a_sample_hides_is_named_with_its_true_size(lag_s: float, named: set[str]) -> None:
     """A force of +-1 N that reaches 0.8 N only and lags by four fifths of a sample, or by a whole one."""
     runs = []

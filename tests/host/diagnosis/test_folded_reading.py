@@ -61,6 +61,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path]]:
     return nominal, files
 
 
+@pytest.mark.long
 def test_the_lost_sign_and_the_mode_behind_it_are_named(drive: tuple[Path, list[Path]]) -> None:
     result = diagnose(read_nominal(drive[0]), drive[1], lambda what, part: None)
     verdict = as_json(result, 0.0)

@@ -106,6 +106,7 @@ def test_forces_act_along_motions_of_their_own_subsystem() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_force_along_a_motion_has_no_module() -> None:
     spec = nominal_of(nominal())
     found = diagnose(spec, [Table(f"r{k}", recorded(k, friction_Nm=0.05, seconds=3.0)) for k in range(2)], lambda *_: None)

@@ -58,7 +58,7 @@ def test_nothing_is_missing(loop: str, noise_m: float) -> None:
 @pytest.mark.parametrize(
     ("loop", "noise_m", "friction_N"),
     [
-        ("steps", 5e-5, 0.3),
+        pytest.param("steps", 5e-5, 0.3, marks=pytest.mark.long),
         pytest.param("steps", 1e-4, 0.6, marks=pytest.mark.long),
         pytest.param("steps", 1.5e-4, 0.9, marks=pytest.mark.long),
         ("smooth", 1e-4, 0.5),
@@ -125,7 +125,12 @@ def pushed(number: int, noise_m: float, acts: Callable[[Array], Array], first: i
 
 @pytest.mark.parametrize(
     ("late", "noise_m", "first"),
-    [(5, 2e-4, 300), pytest.param(5, 1e-5, 300, marks=pytest.mark.long), (2, 2e-4, 300), (5, 2e-4, 0)],
+    [
+        (5, 2e-4, 300),
+        pytest.param(5, 1e-5, 300, marks=pytest.mark.long),
+        pytest.param(2, 2e-4, 300, marks=pytest.mark.long),
+        (5, 2e-4, 0),
+    ],
 )
 def test_a_delay_of_the_force_is_found(late: int, noise_m: float, first: int) -> None:
     """Cut from motion: a speed that was held to four standard deviations of the first readings could not take up the input

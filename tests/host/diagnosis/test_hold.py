@@ -62,11 +62,11 @@ def linear(hold: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("true", "stated", "delay_s", "found"),
     [
-        ("linear", "linear", 0.017, []),
-        ("linear", "linear", 0.05, []),
+        pytest.param("linear", "linear", 0.017, [], marks=pytest.mark.long),
+        pytest.param("linear", "linear", 0.05, [], marks=pytest.mark.long),
         ("zero", "zero", 0.023, []),
         ("zero", "linear", 0.0, ["hold"]),
-        ("linear", "zero", 0.0, ["hold"]),
+        pytest.param("linear", "zero", 0.0, ["hold"], marks=pytest.mark.long),
         ("zero", "linear", 0.03, None),  # a held input that is 30 ms late is nearly a straight one that is 35 ms late
     ],
 )

@@ -184,7 +184,7 @@ def backlash(u: Array, width: float = 0.3) -> Array:
     ("what", "expected"),
     [
         ("nothing", []),
-        ("backlash", [("backlash", "u")]),
+        pytest.param("backlash", [("backlash", "u")], marks=pytest.mark.long),
         ("latency", [("latency", "u")]),
     ],
 )

@@ -122,7 +122,8 @@ def test_windows_are_in_the_files_own_time_and_of_all_recordings(tmp_path: Path)
         assert spans and all(1000.0 + 50.0 * k <= a < b <= 1040.0 + 50.0 * k for a, b in spans)
 
 
-@pytest.mark.parametrize("axis", ["roll", pytest.param("insertion", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("axis", ["roll", "insertion"])
 def test_an_axis_that_rests_hides_nothing_and_breaks_nothing(tmp_path: Path, axis: str) -> None:
     def still(q: np.ndarray, t: np.ndarray) -> np.ndarray:
         return np.zeros_like(q)
@@ -134,6 +135,7 @@ def test_an_axis_that_rests_hides_nothing_and_breaks_nothing(tmp_path: Path, axi
     assert run(*rig_cases.write(tmp_path, truth, 1, duration_s=10.0)).verdict == "nothing_missing"
 
 
+@pytest.mark.long
 def test_a_noisy_force_channel_bends_no_parameter(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
 

@@ -58,7 +58,7 @@ def spring(seed: int, offset_N: float) -> dict[str, Array]:
 @pytest.mark.parametrize(
     ("offset_m", "drift_m_per_s", "named"),
     [
-        pytest.param(0.12, 0.0, {"sensor_bias"}, marks=pytest.mark.slow),
+        pytest.param(0.12, 0.0, {"sensor_bias"}, marks=pytest.mark.long),
         pytest.param(0.0, 2e-4, {"sensor_drift"}, marks=pytest.mark.slow),
         pytest.param(0.12, 2e-4, {"sensor_bias", "sensor_drift"}, marks=pytest.mark.long),
         pytest.param(-0.3, 3e-4, {"sensor_bias", "sensor_drift"}, marks=pytest.mark.long),

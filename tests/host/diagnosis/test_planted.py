@@ -96,6 +96,7 @@ def test_lugre_bristle_is_presliding_friction(tmp_path: Path) -> None:
     assert effect["parameters"]["force_N"]["value"] == pytest.approx(0.3, rel=0.1)
 
 
+@pytest.mark.long
 def test_rig_backlash_is_found_in_its_place(tmp_path: Path) -> None:
     def play(q: np.ndarray, t: np.ndarray) -> np.ndarray:
         y = q.copy()
@@ -110,6 +111,7 @@ def test_rig_backlash_is_found_in_its_place(tmp_path: Path) -> None:
     assert effect["parameters"]["width_m"]["value"] == pytest.approx(1.6e-3, rel=0.1)
 
 
+@pytest.mark.long
 def test_rig_silent(tmp_path: Path) -> None:
     result = run(rig_cases.write(tmp_path, rig_cases.Truth(), 0, duration_s=12.0))
     assert result.verdict == "nothing_missing" and names(result) == []

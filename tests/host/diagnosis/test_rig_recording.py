@@ -62,7 +62,7 @@ def test_nothing_planted_leaves_the_parameters_what_they_are(of_plain: dict[str,
 @pytest.mark.parametrize(
     ("planted", "name", "key", "value"),
     [
-        ("latency@pose_sensor:delay_s=0.05", "latency@pose_sensor", "delay_s", 0.054),
+        pytest.param("latency@pose_sensor:delay_s=0.05", "latency@pose_sensor", "delay_s", 0.054, marks=pytest.mark.long),
         ("backlash@knob:width_rad=0.06", "backlash@knob", "width_rad", 0.06),
     ],
 )
