@@ -49,7 +49,7 @@ class TransmissionModel(Model):
         parameters: list[Parameter] = []
         taken: set[str] = set()
         for name, link in zip(names, self.links, strict=True):
-            others = tuple(link.others)
+            others = self._others(link)
             loads = tuple(link.load) or forces_among(others, self.units)
             turn = "motion+turn" if self.units[link.input] == "rad" else "motion"
             prefix = "" if len(self.links) == 1 else f"{name}_"
@@ -87,9 +87,14 @@ class TransmissionModel(Model):
             dict.fromkeys([link.input for link in self.links] + [name for link in self.links for name in link.load])
         )
 
+    def _others(self, link: LinkSpec) -> tuple[str, ...]:
+        """Channels that may move the output of `link` too: those that the nominal model names, or else all other inputs."""
+        inputs = dict.fromkeys(other.input for other in self.links if other.input != link.input)
+        return tuple(link.others) or tuple(inputs)
+
     def prepare(self, recording: Recording) -> Segment:
         """Return the segment of a recording: missing inputs interpolated, outputs as rows."""
-        names = list(dict.fromkeys(name for link in self.links for name in (link.input, *link.load, *link.others)))
+        names = list(dict.fromkeys(name for link in self.links for name in (link.input, *link.load, *self._others(link))))
         segment = Segment(
             recording,
             stack(recording, [link.output for link in self.links]),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import seldinger as sd
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.model.nominal import read_nominal
@@ -88,3 +89,29 @@ def test_an_equation_that_does_better_is_listed_beside_a_stand_in(
     best = finish(problem, minimize(problem, (term,), np.array(begin)))
     (standing,) = standings(problem, Found(nominal, best, []))
     assert ("unlisted@cable" in [other.name for other in standing.alike]) is equal
+
+
+def test_the_input_of_another_link_is_tried_without_being_named() -> None:
+    recordings = []
+    for number in (1, 2):
+        rng = np.random.default_rng([92, number])
+        t = np.arange(0.0, 20.0, 0.02)
+        phase = rng.uniform(0.0, 6.28, (2, 2))
+        knob = np.sin(2.0 * np.pi * np.outer(t, [0.2, 0.7]) + phase[0]).sum(axis=1)
+        roll = np.sin(2.0 * np.pi * np.outer(t, [0.13, 0.5]) + phase[1]).sum(axis=1)
+        bend, turn = 0.5 * knob + 0.03 * roll, 0.9 * roll
+        noise = 2e-3 * rng.standard_normal((2, t.size))
+        recordings.append({"t": t, "knob": knob, "roll": roll, "bend": bend + noise[0], "turn": turn + noise[1]})
+    nominal = {
+        "name": "handle",
+        "kind": "transmission",
+        "data": {"time": "t"},
+        "channels": {name: {"column": name, "unit": "rad"} for name in ("knob", "roll", "bend", "turn")},
+        "link": [
+            {"subsystem": "knob", "input": "knob", "output": "bend"},
+            {"subsystem": "roll", "input": "roll", "output": "turn"},
+        ],
+    }
+    (found,) = sd.diagnose(recordings, nominal).effects
+    assert (found["id"], found["subsystem"]) == ("coupling", "knob")
+    assert found["parameters"]["gain"]["value"] == pytest.approx(0.03 / 0.5, rel=0.02)
