@@ -225,10 +225,9 @@ def broken(results: Sequence[RunResult]) -> list[object]:
     return [(dataclasses.astuple(one.plan), one.violations) for one in results if one.violations]
 
 
-@pytest.mark.slow
 @pytest.mark.long
 def test_each_fault_breaks_no_rule() -> None:
-    """Every fault once, a third of them in each phase; `make long` has more of them, the campaign all in all phases.
+    """Every fault once, a third of them in each phase; the campaign has all of them in all phases.
 
     Without the supervision of steps, `slipped_steps` breaks a rule here.
     """

@@ -13,7 +13,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Replace a share p[0] of the signal by its magnitude."""
+    """Replace a share p[0] of the signal, or of every component, by its magnitude."""
     return np.asarray(signal + p[0] * (np.abs(signal) - signal))
 
 
@@ -28,11 +28,6 @@ def apply_about_level(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(p[1] + apply(signal - p[1], c, p, form))
 
 
-def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Replace a share p[0] of every component by its magnitude."""
-    return np.asarray(signal + p[0] * (np.abs(signal) - signal))
-
-
 EFFECTS = (
     Effect(
         "rectified_sensor",
@@ -41,7 +36,7 @@ EFFECTS = (
         parameters,
         "The force sensor gives magnitudes only.",
         "y = |x|",
-        apply_force,
+        apply,
         natural_bounds=True,
         hides=True,
     ),

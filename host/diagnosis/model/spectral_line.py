@@ -4,8 +4,8 @@ A sine over time with one phase for all recordings is a candidate effect. If eac
 the disturbance, no such sine fits, and an autoregression predicts a sine as it predicts noise. The line itself shows in
 every periodogram, against the level of the bins around it. A frequency at which the simulated output moves more says
 nothing: the residual rings there if a parameter or a start of the nominal model is a little off. Where another signal, or
-its square, cube or magnitude, has a line there too, a law may have made the one from the other; but then the rest of
-that signal is in the residual as well, and the law answers alike in all recordings. A line that has nearly all of the
+its square, cube or magnitude, has a line there too, a law may have made the one from the other; but then the other parts
+of that signal are in the residual as well, and the law answers alike in all recordings. A line that has nearly all of the
 residual does not come from a signal of which it has next to nothing, nor one of another phase in each recording from one
 that has it in phase.
 """
@@ -74,7 +74,7 @@ def common_line(
 
 
 def _laws(u: Array, x: Array, tone: Tone, dt_s: float, limit: float, rules: DataRules) -> list[complex]:
-    """What each law of `distorted` would have to answer to the signal `u` (n,) at the line `tone` of the residual `x` (n,).
+    """What each law of `_distorted` would have to answer to the signal `u` (n,) at the line `tone` of the residual `x` (n,).
 
     NaN where it cannot have made the line; infinite where it may have, whatever it answers: `u` is such a line itself. A
     filter raises its gain at the line above that elsewhere by `rules.line_gain` at most. A distortion leaves the other parts
@@ -82,19 +82,23 @@ def _laws(u: Array, x: Array, tone: Tone, dt_s: float, limit: float, rules: Data
     """
     bin_ = round(tone.frequency_Hz * u.size * dt_s)
     near = slice(max(bin_ - 1, 0), bin_ + 2)
-    centred, *forms = distorted(u)
+    centred, *forms = _distorted(u)
     taken = np.column_stack([np.ones(u.size), centred, np.gradient(centred)])
     left = [form - taken @ np.linalg.lstsq(taken, form, rcond=None)[0] for form in forms]
     share = 0.5 * tone.amplitude**2 / float(np.var(x))
     least = [share / rules.line_gain**2, *(share * rules.line_origin_share for _ in forms)]
     per_sample = tone.frequency_Hz * dt_s
-    answers = []
+    here, answers = _component(x, per_sample), []
     for form, rest, lowest in zip([centred, *forms], [centred, *left], least, strict=True):
-        part, variance = _component(rest, per_sample), float(np.var(rest))
-        made = np.max(_over_level(form)[near], initial=0.0) > limit and 0.5 * abs(part) ** 2 > lowest * variance
-        answers.append(_component(x, per_sample) / part if made and part != 0.0 else complex(np.nan))
-    itself = 0.5 * abs(_component(centred, per_sample)) ** 2 > rules.line_origin_share * share * float(np.var(centred))
-    return [complex(np.inf) if itself and np.isfinite(answers[0]) else answers[0], *answers[1:]]
+        part = _component(rest, per_sample)
+        has = 0.5 * abs(part) ** 2 / max(float(np.var(rest)), 1e-300)
+        if not (np.max(_over_level(form)[near], initial=0.0) > limit and has > lowest):
+            answers.append(complex(np.nan))
+        elif form is centred and has > rules.line_origin_share * share:
+            answers.append(complex(np.inf))
+        else:
+            answers.append(here / part)
+    return answers
 
 
 def _one_law(answers: npt.NDArray[np.complex128], rules: DataRules) -> bool:
@@ -111,7 +115,7 @@ def _component(x: Array, per_sample: float) -> complex:
     return complex(2.0 * np.sum(window * turns * (x - np.mean(x))) / np.sum(window))
 
 
-def distorted(x: Array) -> list[Array]:
+def _distorted(x: Array) -> list[Array]:
     """Forms of a signal (n,), itself among them, whose lines a nonlinear law makes of those of the signal."""
     centred = fill(x) - np.mean(fill(x))
     speed = np.gradient(centred)

@@ -134,7 +134,8 @@ class ImpedanceModel(Model):
             stiffness = value if term == "stiffness" else stiffness
         port = self.spec.subsystem
         here = [effect for effect in active if effect[0].port.name == port]
-        segment.inputs[f"{port}_spring"] = stiffness * moved.x
+        if any(candidate.effect.source == "spring" for candidate, _ in here):
+            segment.inputs[f"{port}_spring"] = stiffness * moved.x
         force = force + force_along(moved, here, segment, port, float(stiffness))
         return np.asarray(apply_effects(force, active, f"{self.spec.subsystem}_reading", segment, None))[None, :]
 

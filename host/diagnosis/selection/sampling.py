@@ -9,7 +9,7 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.readings import Finding
 from host.diagnosis.selection.refits import fit_nominal, try_fit
 from host.diagnosis.selection.screening import screen
-from host.diagnosis.selection.trial import Trial
+from host.diagnosis.selection.trial import Trial, leads
 
 
 def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates: Sequence[Candidate]) -> list[Finding]:
@@ -74,11 +74,7 @@ def _late(problem: Problem, hold: str, candidates: Sequence[Candidate]) -> Fit:
 def late_by_a_sample(problem: Problem, late: Trial, past: bool = False) -> list[Finding]:
     """Say that a delay within one sample explains a mismatch and is not named. past: it was searched on with it."""
     period_s, port = problem.segments[0].recording.dt_s, late.candidate.port
-    early = any(
-        p.unit == "s" and value < 0.0
-        for p, value in zip(late.fit.terms[-1].parameters, late.fit.values_of(late.fit.terms[-1]), strict=True)
-    )
-    shift = "lead" if early else "delay"
+    shift = "lead" if leads(late) else "delay"
     says = (
         f"A {shift} of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {late.both.share:.0%} "
     )

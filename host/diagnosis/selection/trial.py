@@ -184,8 +184,8 @@ def of_sampling(trial: Trial) -> bool:
         return False
     longest_s = max(r.shape[1] for r in trial.fit.residuals) * trial.period_s
     term = trial.fit.terms[-1]
-    own = list(zip(term.parameters, trial.fit.values_of(term), strict=True))
-    if any(p.unit == "s" and value < 0.0 for p, value in own):
+    own = zip(term.parameters, trial.fit.values_of(term), strict=True)
+    if leads(trial):
         return True
     late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
     late = late_s / trial.period_s
@@ -194,6 +194,12 @@ def of_sampling(trial: Trial) -> bool:
     spread = late / math.sqrt(2.0 * max(trial.both.log_likelihood, 0.5))
     margin = max(rules.sampling_delay_margin, rules.sampling_delay_deviations * spread)
     return late < rules.integrator_delay + margin or min(abs(late - 0.5), abs(late - 1.0)) < margin
+
+
+def leads(trial: Trial) -> bool:
+    """Whether the effect of a trial is a delay below zero."""
+    term = trial.fit.terms[-1]
+    return any(p.unit == "s" and value < 0.0 for p, value in zip(term.parameters, trial.fit.values_of(term), strict=True))
 
 
 def within_sample(trials: list[Trial], base: Fit) -> Trial | None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import TransferFunction, lsim
 
-import host.diagnosis as sd
+import seldinger as sd
 from host.diagnosis.estimation import noise
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import diagnose

@@ -105,7 +105,6 @@ def test_forces_act_along_motions_of_their_own_subsystem() -> None:
     assert list(own.forced.values()) == [("shoulder_Nm", "shoulder_rad"), ("elbow_Nm", "elbow_rad")]
 
 
-@pytest.mark.slow
 @pytest.mark.long
 def test_a_force_along_a_motion_has_no_module() -> None:
     spec = nominal_of(nominal())

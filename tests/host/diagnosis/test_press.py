@@ -8,15 +8,9 @@ import numpy as np
 import pytest
 
 from host.diagnosis import diagnose
+from tests.host.proof.everyday import spring_nominal
 
 RATE_HZ, STIFFNESS, DAMPING, OFFSET = 200.0, 220.0, 3.0, 0.5
-NOMINAL = {
-    "name": "press",
-    "kind": "impedance",
-    "data": {"time": "t"},
-    "channels": {"motion": {"column": "x", "unit": "m"}, "force": {"column": "f", "unit": "N"}},
-    "impedance": {"subsystem": "press", "input": "motion", "output": "force", "terms": ["damping", "stiffness", "offset"]},
-}
 
 
 def strokes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -54,11 +48,29 @@ def pressed(number: int, gap_m: float = 0.0, rubs: float = 0.0, mass_kg: float =
 )
 def test_it_is_named_with_its_size(missing: dict[str, float], name: str, parameter: str, value: float) -> None:
     """A gap was named friction of a negative force; this friction Coulomb's or an equation; a mass, one on a spring."""
-    (found,) = diagnose([pressed(k, **missing) for k in (1, 2)], NOMINAL).effects
+    (found,) = diagnose([pressed(k, **missing) for k in (1, 2)], spring_nominal()).effects
     assert found["id"] == name
     assert found["probability"] >= 0.9
     assert found["parameters"][parameter]["value"] == pytest.approx(value, rel=0.05)
 
 
+def behind_a_wrap(number: int, exponent: float) -> dict[str, Any]:
+    """The force of a spring under 6 N of tension, read behind a rope round a post (Euler, Eytelwein)."""
+    rng = np.random.default_rng([93, number])
+    t, x, _, _ = strokes(rng)
+    pull = STIFFNESS * x + 6.0
+    read, grip = pull.copy(), np.exp(exponent)
+    for i in range(1, t.size):
+        low, high = sorted((pull[i] / grip, pull[i] * grip))
+        read[i] = min(max(read[i - 1], low), high)
+    return {"t": t, "x": x, "f": read + 0.01 * rng.standard_normal(t.size)}
+
+
+def test_a_wrap_before_the_force_sensor_is_named_with_its_exponent() -> None:
+    (found,) = diagnose([behind_a_wrap(k, 0.1) for k in (1, 2)], spring_nominal()).effects
+    assert found["id"] == "load_dependent_friction"
+    assert found["parameters"]["exponent"]["value"] == pytest.approx(0.1, rel=0.02)
+
+
 def test_a_spring_and_a_damper_miss_nothing() -> None:
-    assert diagnose([pressed(k) for k in (1, 2)], NOMINAL).verdict == "nothing_missing"
+    assert diagnose([pressed(k) for k in (1, 2)], spring_nominal()).verdict == "nothing_missing"

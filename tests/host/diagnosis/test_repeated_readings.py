@@ -52,7 +52,6 @@ def test_a_reading_that_is_logged_again_and_again_is_no_lag(samples: float) -> N
     assert f"for {int(samples)} samples" in finding["says"]
 
 
-@pytest.mark.slow
 @pytest.mark.long
 def test_a_delay_behind_it_is_found_with_its_whole_value() -> None:
     effects = sd.diagnose(logged(4, 0.06), STAGE).effects
