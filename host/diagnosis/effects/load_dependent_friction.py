@@ -11,6 +11,8 @@ from host.diagnosis.effects.presliding_friction import build_up, yielding
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 from host.diagnosis.model.operators import capstan, dahl, pressed
 
+LARGEST_SHARE = 0.7  # of the force of a spring that the friction it presses takes
+
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion per load, and the distance of its build-up."""
@@ -28,10 +30,16 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def by_spring(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """The same with the force of the spring, which is not recorded, and the force of which it is counted."""
+    """The same with the force of the spring, which is not recorded, and the force of which it is counted.
+
+    A spring that presses what rubs pushes back against the friction too: near a coefficient of 1 it would hold itself, so
+    the coefficient stays below LARGEST_SHARE and has the sign of the stiffness. It is relaxed within its recorded travel or
+    one travel outside; farther outside its force hardly changes, and the friction is Coulomb's.
+    """
+    coefficient, builds_up = force(s, form)
     span = s.source_span
-    zero = Parameter("zero", s.source_unit, (-0.4 * span, 0.0, 0.4 * span), -2.0 * span, 2.0 * span, step=0.01 * span)
-    return (*force(s, form), zero)
+    zero = Parameter("zero", s.source_unit, (-0.4 * span, 0.0, 0.4 * span), -span, span, step=0.01 * span)
+    return replace(coefficient, high=LARGEST_SHARE, follows="stiffness"), builds_up, zero
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

@@ -77,7 +77,7 @@ def _either(p: Parameter, nominal: dict[str, float]) -> Parameter:
     sign = nominal.get(p.follows, 0.0)
     if sign > 0.0:
         return p
-    return replace(p, low=-np.inf, high=0.0) if sign < 0.0 else replace(p, low=-np.inf)
+    return replace(p, low=-p.high, high=0.0) if sign < 0.0 else replace(p, low=-p.high)
 
 
 def without(fit: Fit, problem: Problem, drop: tuple[str, ...]) -> tuple[tuple[Term, ...], Array]:
