@@ -15,6 +15,9 @@ from host.diagnosis.model.model import ActiveEffect, Model, Segment
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+STEPS_OF_A_STATE = 4  # from the measured state, at most
+WEIGHINGS = 3  # of the outputs by what a step leaves
+FINE_SHARE = 0.05  # of a standard deviation, of difference quotients about an estimated state
 STATE_STEPS = 3  # of parameters and initial states together
 SHARES = (1.0, 0.5, 0.25)  # of such a step that are tried
 STATE_ROUNDS = 4  # of such steps and a fit of the parameters alone, at most
@@ -23,10 +26,11 @@ FARTHEST = 4.0  # standard deviations of the measured state within which the est
 
 
 def estimate_state(model: Model, segment: Segment, theta: Array, active: list[ActiveEffect], unseen: int = 0) -> None:
-    """Estimate `segment.begin` by one Gauss-Newton step from the measured state.
+    """Estimate `segment.begin` by Gauss-Newton steps from the measured state.
 
     Measured state and outputs are weighed by their variances; that of an output's mean counts correlated samples once.
-    Nothing happens where the model knows its state.
+    One step is enough where the outputs are linear in the state. Another one follows where they end elsewhere than the
+    step predicted, by as much as their noise would move a state. Nothing happens where the model knows its state.
 
     unseen: first samples that a dead time makes of what was before the recording. No state explains them.
     """
@@ -37,19 +41,46 @@ def estimate_state(model: Model, segment: Segment, theta: Array, active: list[Ac
     if not moving.size:
         return
     begin.values = begin.measured.copy()
-    base = model.simulate(segment, theta, active)
-    r = segment.y - base
+    at, share = np.zeros(moving.size), 1.0  # standard deviations from the measured state; that of the difference quotients
+    r = _left(model, segment, theta, active, unseen)
+    for _ in range(STEPS_OF_A_STATE):
+        base, columns = begin.values, []
+        for k in moving:
+            begin.values = base + np.eye(base.size)[k] * share * begin.spread[k]
+            columns.append((r - _left(model, segment, theta, active, unseen)) / share)
+        to, predicted, scale = _step(r, np.array(columns), at)
+        begin.values = begin.measured.copy()
+        begin.values[moving] += to * begin.spread[moving]
+        now = _left(model, segment, theta, active, unseen)
+        if not float(np.nansum(((now - predicted) / scale) ** 2)) > 1.0:
+            return
+        at, r, share = to, now, FINE_SHARE
+
+
+def _step(r: Array, rates: Array, at: Array) -> tuple[Array, Array, Array]:
+    """Return where a step leads (k,), the residual (outputs, n) predicted there, and the size (outputs, 1) of one of its
+    independent samples.
+
+    r: residual (outputs, n); rates (k, outputs, n): by how much it falls for a standard deviation of each state; at (k,):
+    where the states are, in standard deviations from the measured ones. The outputs are weighed by what the step leaves of
+    them: what it takes away says nothing of their noise.
+    """
+    used, predicted = np.isfinite(r), r
+    to = at
+    for _ in range(WEIGHINGS):
+        scale = np.array([_weighing(row) for row in predicted])[:, None]
+        A = np.array([(rate / scale)[used] for rate in rates]).T
+        by = np.linalg.solve(A.T @ A + np.eye(at.size), A.T @ (r / scale)[used] - at)
+        to = np.clip(at + by, -FARTHEST, FARTHEST)
+        predicted = r - np.tensordot(to - at, rates, axes=1)
+    return to, predicted, scale
+
+
+def _left(model: Model, segment: Segment, theta: Array, active: list[ActiveEffect], unseen: int) -> Array:
+    """Residual (outputs, n) from the state that the recording begins with now."""
+    r = segment.y - model.simulate(segment, theta, active)
     r[:, :unseen] = np.nan
-    changes = []
-    for k in moving:
-        begin.values = begin.measured + np.eye(begin.spread.size)[k] * begin.spread[k]
-        changes.append(model.simulate(segment, theta, active) - base)
-    scale = np.array([_weighing(row) for row in r])[:, None]
-    used = np.isfinite(r)
-    A = np.array([np.broadcast_to(change / scale, r.shape)[used] for change in changes]).T
-    by = np.linalg.solve(A.T @ A + np.eye(moving.size), A.T @ (r / scale)[used])
-    begin.values = begin.measured.copy()
-    begin.values[moving] += np.clip(by, -FARTHEST, FARTHEST) * begin.spread[moving]
+    return np.asarray(r)
 
 
 @dataclass(frozen=True)

@@ -409,3 +409,41 @@ def test_a_simulator_that_gives_no_numbers_others_each_time_or_one_is_refused() 
     for function, found in ((shaken, "differs by"), (lost, "no number in z"), (deaf, "stays at 0.3 while its inputs move")):
         with pytest.raises(InputError, match=found):
             sd.diagnose([swinging(k) for k in (1, 2, 3)], swing(function, **FREE))
+
+
+@njit(cache=True)
+def hung(torque: Array, dt_s: float, angle: float, rate: float, damping: float, weight: float) -> Array:
+    """Angle of a pendulum of 0.04 kg m2, four steps a sample, the torque straight between samples."""
+    out, h = np.empty(torque.size), dt_s / 4
+    for i in range(torque.size):
+        out[i] = angle
+        for j in range(4):
+            pull = torque[i] + (torque[min(i + 1, torque.size - 1)] - torque[i]) * j / 4
+            rate += h * (pull - damping * rate - weight * np.sin(angle)) / 0.04
+            angle += h * rate
+    return out
+
+
+def hanging(inputs: dict[str, Array], p: dict[str, float], time_s: Array, start: dict[str, float]) -> dict[str, Array]:
+    dt_s = float(time_s[1] - time_s[0])
+    return {"q": hung(inputs["T"], dt_s, start["q"], start["q_rate"], p["damping"], p["weight"])}
+
+
+def test_a_state_is_found_far_from_where_it_is_measured() -> None:
+    """The rate at rest was put 0.08 rad/s off, and a delay was named that hid it. The outputs are not linear in it."""
+    rows, t = [], np.arange(0.0, 10.0, 0.01)
+    for number in range(2):
+        rng = np.random.default_rng([96, number])
+        tones = np.sin(2.0 * np.pi * np.outer(t, (0.15, 0.4, 0.9)) + rng.uniform(0.0, 6.28, 3))
+        torque = 0.28 * tones @ np.array([1.0, 0.6, 0.4])
+        angle = hung(torque, 0.01, 0.0, 0.0, 0.03, 0.7)
+        rows.append({"t": t, "T": torque, "q": angle + 2e-3 * rng.standard_normal(t.size)})
+    section = {"function": hanging, "inputs": ["T"], "outputs": ["q"]}
+    parameters = {"damping": {"value": 0.02, "low": 0.0, "high": 1.0}, "weight": {"value": 0.6, "low": 0.01, "high": 5.0}}
+    channels = {"T": {"column": "T", "unit": "N m"}, "q": {"column": "q", "unit": "rad"}}
+    nominal = {"name": "pendulum", "kind": "callable", "data": {"time": "t"}, "channels": channels, "callable": section}
+    found = sd.diagnose(rows, {**nominal, "parameters": parameters})
+    assert found.verdict == "nothing_missing"
+    problem = found.diagnosis.problem
+    rates = [float(segment.begin.values[1]) for segment in problem.segments if segment.begin is not None]
+    assert rates == pytest.approx([0.0, 0.0], abs=0.01)
