@@ -50,8 +50,8 @@ from host.diagnosis.selection.locate import Location, locate, unexplained
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.selection.remarks import (
-    above_guess,
     jumps_in_level,
+    larger_than_noise,
     lines_in_spectrum,
     noise_of_motion,
     read_seldom,
@@ -281,7 +281,7 @@ def _diagnosed(
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best)
         late = any(finding.id == "within_sample" for finding in done.findings)  # it explains what exceeds the noise
-        result.findings += slow_noise(full, fits, slow) or ([] if late else above_guess(full, figures, problem.rules))
+        result.findings += slow_noise(full, fits, slow) or ([] if late else larger_than_noise(full, fits, figures))
     if not located and remainder.sure and remainder.predicted is not None:
         result.located = [unexplained(full, fits, remainder.predicted.subsystem)]
     overall.end()

@@ -114,7 +114,8 @@ def _p_value(by_output: list[list[float]], rules: SelectionRules) -> float:
     return float(min(1.0, together, alone * len(by_output))) if len(by_output) > 1 else together
 
 
-def _asked(segment: Segment, which: str) -> Mask:
+def asked(segment: Segment, which: str) -> Mask:
+    """Samples (n,) of a recording to `fit`, those `heldout`, or `both`."""
     return np.asarray(segment.fit | segment.heldout) if which == "both" else np.asarray(getattr(segment, which))
 
 
@@ -124,7 +125,7 @@ def _pooled(
     sum_b = sum_a = count = n_eff = 0.0
     times = []
     for segment, b, a in zip(segments, before, after, strict=True):
-        mask = _asked(segment, which) & np.isfinite(b[row]) & np.isfinite(a[row])
+        mask = asked(segment, which) & np.isfinite(b[row]) & np.isfinite(a[row])
         n = int(mask.sum())
         if n < 20:
             times.append(1.0)
@@ -143,7 +144,7 @@ def _blocks(
 ) -> list[float]:
     found = []
     for segment, b, a, tau in zip(segments, before, after, times, strict=True):
-        mask = _asked(segment, which) & np.isfinite(b[row]) & np.isfinite(a[row])
+        mask = asked(segment, which) & np.isfinite(b[row]) & np.isfinite(a[row])
         gained = (b[row][mask] ** 2 - a[row][mask] ** 2) / level
         length = int(max(4.0 * tau, gained.size / 24.0, 8.0))
         parts = max(1, gained.size // length)

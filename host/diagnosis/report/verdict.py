@@ -21,7 +21,16 @@ from host.diagnosis.selection.locate import Location, joined
 from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
 # Findings on what these data cannot decide, the most important one first.
-UNDECIDED = ("line", "noise_fed_back", "noise_passed_on", "slow_noise", "noise_unseen", "within_sample", "excitation")
+UNDECIDED = (
+    "line",
+    "noise_fed_back",
+    "noise_passed_on",
+    "slow_noise",
+    "noise_unseen",
+    "above_noise",
+    "within_sample",
+    "excitation",
+)
 REMARKS = (
     "outliers",
     "quantized",

@@ -8,9 +8,9 @@ import numpy.typing as npt
 from host.diagnosis.estimation.coloured import independent_samples
 from host.diagnosis.estimation.fit import Problem
 from host.diagnosis.estimation.jumps import jumps_of
-from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.spectral_line import common_line
+from host.diagnosis.selection.between_recordings import root_mean_square
 from host.diagnosis.selection.full_rate import Figures, FullRate, rms
 
 Array = npt.NDArray[np.float64]
@@ -117,16 +117,26 @@ def slow_noise(full: Problem, fits: FullRate, rows: list[int]) -> list[Finding]:
     return findings
 
 
-def above_guess(full: Problem, figures: Figures, rules: SelectionRules) -> list[Finding]:
-    """Sentences on outputs whose residual is larger than a noise that was never seen alone: it may be noise all the same."""
+def larger_than_noise(full: Problem, fits: FullRate, figures: Figures) -> list[Finding]:
+    """Sentences on outputs whose residual is larger than the noise, in held-out samples or in all, and not surely so."""
     findings = []
-    for output, left, noise in zip(full.model.outputs, figures.after, full.noise, strict=True):
-        if noise.source.seen_alone or not left > rules.residual_over_noise * noise.sigma:
+    rules, everywhere = full.rules, root_mean_square(full, fits.best.residuals)
+    for row, (output, noise) in enumerate(zip(full.model.outputs, full.noise, strict=True)):
+        left = max(figures.after[row], everywhere[row])
+        if not left > rules.residual_over_noise * noise.sigma:
             continue
         column = full.columns.get(output.channel, output.channel)
         ratio = left / max(noise.sigma, 1e-300)
-        says = f"The residual of column {column}, {left:.3g} {output.unit} RMS, is {ratio:.2g} times the noise that its "
-        says += "spectrum suggests. The noise was never recorded alone, so this may be slower noise, or a mismatch that no "
-        says += "effect explains: record some seconds at rest, or the same motion twice."
-        findings.append(Finding("noise_unseen", column, says))
+        says = f"The residual of column {column}, {left:.3g} {output.unit} RMS, is {ratio:.2g} times the noise that "
+        if noise.source.seen_alone:
+            says += "was recorded alone. No effect explains it, and up to "
+            says += f"{rules.residual_over_noise_nominal:.2g} times may be the simplifications of a model: something small "
+            says += "may be missing. Record larger and faster motions, and diagnose again."
+            findings.append(Finding("above_noise", column, says))
+        else:
+            says += (
+                "its spectrum suggests. The noise was never recorded alone, so this may be slower noise, or a mismatch that "
+            )
+            says += "no effect explains: record some seconds at rest, or the same motion twice."
+            findings.append(Finding("noise_unseen", column, says))
     return findings

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.coloured import only_coloured, too_slow
+from host.diagnosis.estimation.evidence import asked
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.model.effect import Port
@@ -61,12 +62,12 @@ def remaining_share(problem: Problem, found: Found) -> float:
 
 def _above_noise(problem: Problem, found: Found) -> bool:
     """Whether the best model leaves more than the noise of some output can be: noise known from quiescent parts, or
-    guessed.
+    guessed. What the fitted samples leave counts, too: held-out ones may hardly show what is missing.
     """
     measured = problem.rules.residual_over_noise if found.best.terms else problem.rules.residual_over_noise_nominal
     noise_sd = _levels(problem, found.best)
     return any(
-        _power(problem, found.best.residuals, row)
+        max(_power(problem, found.best.residuals, row), _power(problem, found.best.residuals, row, "both"))
         > ((measured if noise.source.seen_alone else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
         or (
             not found.best.terms and bool(jumps_of([r[row] for r in found.best.residuals], problem.rules))
@@ -100,8 +101,8 @@ def slow_outputs(problem: Problem, fit: Fit) -> list[int]:
     ]
 
 
-def _power(problem: Problem, residuals: list[Array], row: int) -> float:
-    parts = [r[row][segment.heldout] for segment, r in zip(problem.segments, residuals, strict=True)]
+def _power(problem: Problem, residuals: list[Array], row: int, which: str = "heldout") -> float:
+    parts = [r[row][asked(segment, which)] for segment, r in zip(problem.segments, residuals, strict=True)]
     together = np.concatenate(parts)
     together = together[np.isfinite(together)]
     return float(np.mean(together**2)) if together.size else 0.0
