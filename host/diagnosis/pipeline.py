@@ -31,8 +31,9 @@ from host.diagnosis.model.pairs import driven_of
 from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
+from host.diagnosis.models.simulated import driven_along
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
-from host.diagnosis.selection.between_recordings import inadequate, unlike_recordings
+from host.diagnosis.selection.between_recordings import inadequate, root_mean_square, unlike_recordings
 from host.diagnosis.selection.corners import over_alike
 from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
 from host.diagnosis.selection.early import early_outputs
@@ -66,6 +67,7 @@ from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
+FIRST_SHARE = 0.6  # of the progress of a search that a second one may follow
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 
 
@@ -196,7 +198,41 @@ def diagnose(
     """
     _keep_freed_memory()
     with threadpool_limits(1, "blas"):  # products of a few columns: threads that wait for each other took 4 times the work
-        return _diagnosed(spec, sources, progress, left_out, rules, Budget(time_budget_s))
+        budget, further = Budget(time_budget_s), _with_forces_inside(spec)
+        if further is None:
+            return _diagnosed(spec, sources, progress, left_out, rules, budget)
+        first = _diagnosed(spec, sources, _share_of(progress, 0.0, FIRST_SHARE), left_out, rules, budget)
+        if budget.spent() or not _unexplained(first):
+            progress("done", 1.0)
+            return first
+        second = _diagnosed(further, sources, _share_of(progress, FIRST_SHARE, 1.0), left_out, rules, budget)
+        return second if _explains_more(second, first) else first
+
+
+def _with_forces_inside(spec: NominalSpec) -> NominalSpec | None:
+    """`spec` with forces along measured motions among its simulator's candidates; None where it has or can have none."""
+    section, units = spec.simulator, {name: channel.unit for name, channel in spec.channels.items()}
+    if section is None or section.forces_inside or spec.kind == "linear" or not driven_along(section, units):
+        return None
+    return spec.model_copy(update={spec.kind: section.model_copy(update={"forces_inside": True})})
+
+
+def _share_of(progress: Progress, low: float, high: float) -> Progress:
+    return lambda what, share: progress(what, low + (high - low) * share)
+
+
+def _unexplained(result: Diagnosis) -> bool:
+    """Whether more is left than noise, which may be a guess: a further search is worth its time."""
+    left = np.maximum(result.figures.after, root_mean_square(result.full, result.full_rate.best.residuals))
+    return result.remainder.sure or bool(np.any(left > result.full.rules.residual_over_noise * result.figures.noise_sd))
+
+
+def _explains_more(second: Diagnosis, first: Diagnosis) -> bool:
+    """Whether forces inside the simulator are named, and leave less of the output that is compared."""
+    inside = any(term.candidate.port.against for term in second.found.best.terms)
+    row, most = first.figures.primary, 1.0 - first.problem.rules.refinement_error_reduction
+    less = second.figures.after[row] < most * first.figures.after[row]
+    return second.verdict == "missing_physics" and inside and bool(less)
 
 
 def _keep_freed_memory() -> None:

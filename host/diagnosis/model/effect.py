@@ -199,6 +199,7 @@ class Port:
     offers: tuple[Effect, ...] = ()  # parameters of a simulator that compete as effects, of this port alone
     held: bool = False  # an input that is held between samples: a delay within one sample is how it was held
     within: str = ""  # port of the link that this place along a loaded link belongs to: an equation acts there
+    against: bool = False  # forces there count against the motion, never with it, also where a reading may count either way
     path: tuple[str, ...] = ()  # this port and those to which a linear time-invariant model alone leads
 
 

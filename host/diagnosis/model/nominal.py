@@ -118,9 +118,11 @@ class StateSpec(Request):
 class SimulatorSpec(Request):
     """Common section of kinds that run a simulator: input and output channels, ports, and initial states.
 
-    `ports`: channel -> subsystem in the verdict; channels without one belong to `subsystem`.
+    `ports`: channel -> subsystem in the verdict; channels without one belong to `subsystem`. `forces_inside`: whether
+    forces along measured motions compete from the start; else they are tried where nothing else explains the outputs.
     """
 
+    forces_inside: bool = False
     inputs: list[str]
     outputs: list[str] = Field(min_length=1)
     subsystem: str = "model"

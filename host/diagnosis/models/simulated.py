@@ -60,6 +60,10 @@ TRUSTED = 0.25  # error of a linearized input relative to a simulation, up to wh
 FIT_CALLS = 60  # simulations of a recording in which a candidate is fitted in full; printed beforehand
 FITS = 10  # candidates that are fitted in full, about
 FORCE_OF = {"rad": "N m", "m": "N"}  # unit of the force that does work along a motion
+OF_A_MOTOR = ("V", "mV", "A", "mA")  # units of inputs that stand for the force of a motor
+# Linear laws of a measured motion: with one of them a simulator is an observer, which follows whatever was measured.
+LINEAR_LAWS = ("viscous_friction:", "creep_relaxation:", "resonance:", "softening:")
+PLACE_OF = {"rad": "rad", "m": "m", "rad/s": "rad", "m/s": "m"}  # unit of the place that a reading is, or is the rate of
 CHAIN = "payload"  # port of what hangs on an arm
 WEIGHT = "weight"  # port of a force that acts in addition to recorded loads
 MOST_LINKS = 4
@@ -152,10 +156,12 @@ class SimulatedModel(Model):
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
         self.session_offsets = [name for name in (*section.inputs, *section.outputs) if spec.channels[name].session_offset]
         inputs, outputs = section.inputs, section.outputs
-        self.forced, self.chain = self._forced(), self._chain()
+        self.forced, self.chain, self.along = self._forced(), self._chain(), driven_along(section, self.units)
         self.weighed = tuple(n for n in section.load if n in section.inputs and is_force(self.units[n]) and self.shifted)
         self.outputs = tuple(Output(name, self.units[name], self.subsystem_of(name)) for name in outputs)
-        self.ports = (*self._signal_ports(), *self._offered_ports(offers))
+        inside = self._ports_along() if section.forces_inside else []
+        self.ports = (*self._signal_ports(), *inside, *self._offered_ports(offers))
+        self.taken |= {f"{law}@{port.name}" for law in LINEAR_LAWS for port in inside}
         parameters = []
         for key, declared in spec.parameters.items():
             low, high = declared.bounds() if declared.free else (declared.value, declared.value)
@@ -235,6 +241,14 @@ class SimulatedModel(Model):
             own = [pair for pair in zip(forces, motions, strict=False) if pair in pairs]
         return {f"{force}_along_{motion}": (force, motion) for force, motion in own or pairs}
 
+    def _ports_along(self) -> list[Port]:
+        section, found = self.section, []
+        for name, (force, motion) in self.along.items():
+            others = tuple(other for other in section.inputs if other != force)
+            outputs, subsystem = tuple(section.outputs), self.subsystem_of(motion)
+            found.append(Port(name, "force", subsystem, outputs, tuple(section.load), others, against=True))
+        return found
+
     def _offered_ports(self, offers: list[OfferSpec]) -> list[Port]:
         """A port for every offered parameter, with its one effect."""
         found: list[Port] = []
@@ -275,6 +289,11 @@ class SimulatedModel(Model):
                 segment.tolerances[port.name] = tolerance_of(motion, float(np.ptp(motion)))
                 segment.units[port.name] = self.units[port.channels[0]]
                 segment.units[f"motion:{port.name}"] = self.units[self.forced[port.name][1]]
+            elif port.name in self.along:
+                force, motion_read = self.along[port.name]
+                segment.tolerances[port.name] = self._moved_of(segment, motion_read).tolerance
+                segment.units[port.name] = self.units[force]
+                segment.units[f"motion:{port.name}"] = PLACE_OF[self.units[motion_read]]
             elif port.name not in self.inside and port.name.endswith("_reading"):
                 segment.units[port.name] = self.units[port.channels[0]]
         segment.begin = self._begin(segment)
@@ -346,12 +365,23 @@ class SimulatedModel(Model):
                 total = total + candidate.effect.apply(moved, context, values, candidate.form)
         return total
 
-    @staticmethod
-    def _moved_of(segment: Segment, motion: str) -> Moved:
+    def _moved_of(self, segment: Segment, motion: str) -> Moved:
+        """Return the motion that a channel reads; of one that reads a speed, its integral from zero."""
         assert isinstance(segment, ForcedSegment)
         if motion not in segment.moved:
-            segment.moved[motion] = Moved.of(filled(segment.recording, [motion])[motion], segment.recording)
+            moved = Moved.of(filled(segment.recording, [motion])[motion], segment.recording)
+            if self.units[motion].endswith("/s"):
+                place = np.cumsum(moved.x) * segment.recording.dt_s
+                moved = replace(moved, x=place, v=moved.x, a=moved.v, tolerance=tolerance_of(place, float(np.ptp(place))))
+            segment.moved[motion] = moved
         return segment.moved[motion]
+
+    def _taken(self, segment: Segment, name: str, active: list[ActiveEffect]) -> Array:
+        """Force (n,) along a measured motion that is missing at an input."""
+        here = [effect for effect in active if effect[0].port.name == name]
+        if not here:
+            return np.zeros(segment.n)
+        return force_along(self._moved_of(segment, self.along[name][1]), here, segment, name)
 
     def run_many(self, runs: list[SimulatorRun]) -> list[Array]:
         """Outputs (outputs, n) of each of `runs`."""
@@ -370,6 +400,9 @@ class SimulatedModel(Model):
         for name in self.section.inputs:
             signal = segment.inputs[name] + begin.get(f"offset:{name}", 0.0)
             given[name] = apply_effects(signal, active, name, segment, None)
+        for place in dict.fromkeys(c.port.name for c, _ in active if c.port.name in self.along):
+            force = self.along[place][0]
+            given[force] = given[force] - self._taken(segment, place, active)
         values = {p.name: float(value) for p, value in zip(self.parameters, theta, strict=True)}
         for candidate, its in active:
             if candidate.port.kind == "offered":
@@ -527,6 +560,9 @@ class SimulatedModel(Model):
             error, best = min((_misfit(answer.to(trial), change), k) for k, answer in enumerate(answers))
             if error < TRUSTED:
                 found[name] = answers[best]
+        for place, (force, _) in self.along.items() if self.section.forces_inside else ():
+            if force in found:
+                found[place] = replace(found[force], active=[effect for effect in active if effect[0].port.name == place])
         return found
 
     def _moved(self, segment: Segment, theta: Array, active: list[ActiveEffect], name: str, by: Array) -> Array:
@@ -538,7 +574,11 @@ class SimulatedModel(Model):
     ) -> Array:
         """Linearized change of the outputs (outputs, n) by a candidate at an input, after the effects that act there."""
         name = candidate.port.name
-        here, u = slopes[name].active, segment.inputs[name]
+        here = slopes[name].active
+        if name in self.along:
+            more = self._taken(segment, name, [*here, (candidate, values)])
+            return slopes[name].to(self._taken(segment, name, here) - more)
+        u = segment.inputs[name]
         before = apply_effects(u, here, name, segment, None)
         return slopes[name].to(apply_effects(u, [*here, (candidate, values)], name, segment, None) - before)
 
@@ -550,6 +590,8 @@ class SimulatedModel(Model):
         """The input at its port, the motion that a force acts along, or the measured output."""
         if port.name in self.forced:
             return segment.inputs[self.forced[port.name][1]]
+        if port.name in self.along:
+            return self._moved_of(segment, self.along[port.name][1]).x
         if port.kind == "chain":
             return segment.inputs[self.chain[-1][1]]
         if port.kind == "weight":
@@ -565,6 +607,8 @@ class SimulatedModel(Model):
         """
         if port.kind == "weight":
             return min((self._need(segment, name, theta, residual) for name in self.weighed), key=np.linalg.norm)
+        if port.name in self.along:
+            return self._need(segment, self.along[port.name][0], theta, residual)
         if port.name not in segment.inputs:
             return np.asarray(residual[self.section.outputs.index(port.channels[0])])
         return self._need(segment, port.name, theta, residual)
@@ -579,6 +623,25 @@ class SimulatedModel(Model):
         return np.asarray(
             np.sum(s * np.nan_to_num(residual) / weight, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300)
         )
+
+
+def driven_along(section: SimulatorSpec, units: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """Return ports of forces inside a simulator that gets forces and predicts motions, with their input and output.
+
+    Such a force (a friction, a spring, a drag) follows the motion that is measured, and is as good as one at the input. That
+    of a motor is stated in the voltage or the current that overcomes it.
+    """
+    pairs = [
+        (force, motion)
+        for force in section.inputs
+        for motion in section.outputs
+        if (place := PLACE_OF.get(units[motion]))
+        and (units[force] in OF_A_MOTOR or FORCE_OF[place] == FORCES.get(units[force]))
+    ]
+    if len(pairs) > MOST_FORCED:
+        pairs = [pair for pair in pairs if all(name in section.ports for name in pair)]
+        pairs = [(a, b) for a, b in pairs if section.ports[a] == section.ports[b]]
+    return {f"{force}_along_{motion}": (force, motion) for force, motion in pairs[:MOST_FORCED]}
 
 
 UNSCALED = Scale("", 1.0, 0.0, 1.0, 1.0, 1e-3, 1.0, 1e-2, 10.0, True)

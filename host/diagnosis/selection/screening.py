@@ -53,7 +53,7 @@ def term_of(problem: Problem, candidate: Candidate, fit: Fit, sizes: dict[str, f
     rms = sizes[candidate.port.name]
     scale = scale_of(problem.model, problem.segments, candidate.port, candidate, rms)
     parameters = candidate.effect.parameters(scale, candidate.form)
-    if problem.model.either_sign and candidate.effect.slots is not None:
+    if problem.model.either_sign and candidate.effect.slots is not None and not candidate.port.against:
         nominal = fit.values[: len(problem.model.parameters)]
         own = {p.name: float(value) for p, value in zip(problem.model.parameters, nominal, strict=True)}
         parameters = tuple(_either(p, own) if p.linear and p.low == 0.0 else p for p in parameters)

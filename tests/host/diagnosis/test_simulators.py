@@ -447,3 +447,87 @@ def test_a_state_is_found_far_from_where_it_is_measured() -> None:
     problem = found.diagnosis.problem
     rates = [float(segment.begin.values[1]) for segment in problem.segments if segment.begin is not None]
     assert rates == pytest.approx([0.0, 0.0], abs=0.01)
+
+
+@njit(cache=True)
+def driven(force: Array, dt_s: float, place: float, speed: float, law: tuple[float, ...]) -> Array:
+    """Places and speeds (2, n) of a mass; law: mass, damping, stiffness, cubic stiffness, drag (square of the speed)."""
+    mass, damping, stiffness, cubic, drag = law
+    out, h = np.empty((2, force.size)), dt_s / 8
+    for i in range(force.size):
+        out[0, i], out[1, i] = place, speed
+        for _ in range(8):
+            held = damping * speed + stiffness * place + cubic * place**3 + drag * speed * abs(speed)
+            speed += h * (force[i] - held) / mass
+            place += h * speed
+    return out
+
+
+def sprung(inputs: dict[str, Array], p: dict[str, float], time_s: Array, start: dict[str, float]) -> dict[str, Array]:
+    law = (0.5, p["damping"], p["stiffness"], 0.0, 0.0)
+    return {"x": driven(inputs["F"], float(time_s[1] - time_s[0]), start["x"], start["x_rate"], law)[0]}
+
+
+def rolling(inputs: dict[str, Array], p: dict[str, float], time_s: Array, start: dict[str, float]) -> dict[str, Array]:
+    law = (p["mass"], p["damping"], 0.0, 0.0, 0.0)
+    return {"v": driven(inputs["u"], float(time_s[1] - time_s[0]), 0.0, start["v"], law)[1]}
+
+
+def pushed(
+    dt_s: float, samples: int, size: float, law: tuple[float, float, float, float, float]
+) -> list[tuple[Array, Array]]:
+    """Three forces (n,) of several tones, and the motion (2, n) each drives, cut from motion."""
+    out, t = [], np.arange(samples + 200) * dt_s
+    for number in range(3):
+        rng = np.random.default_rng([97, number])
+        angle = 2.0 * np.pi * np.outer(t, np.array([0.0012, 0.0027, 0.006, 0.011]) / dt_s) + rng.uniform(0.0, 6.28, 4)
+        force = size * np.sin(angle) @ np.array([1.0, 0.7, 0.5, 0.4])
+        out.append((force[200:], driven(force, dt_s, 0.0, 0.0, law)[:, 200:]))
+    return out
+
+
+def test_a_hardening_spring_inside_a_simulator_is_found() -> None:
+    """A resonance was named (0.48): effects were tried at the input and at the reading only."""
+    rng, dt_s, rows = np.random.default_rng(98), 0.005, []
+    for force, (place, _) in pushed(dt_s, 2000, 1.5, (0.5, 2.0, 120.0, 4e4, 0.0)):
+        reading = place + 2e-4 * rng.standard_normal(place.size)
+        rows.append({"t": np.arange(force.size) * dt_s, "F": force, "x": reading})
+    nominal = free_of("sprung", sprung, ("F", "N"), ("x", "m"), damping=1.5, stiffness=150.0)
+    nominal["callable"]["forces_inside"] = True
+    (effect,) = sd.diagnose(rows, nominal).effects
+    assert (effect["id"], effect["port"]) == ("nonlinear_stiffness", "F_along_x")
+    assert effect["parameters"]["cubic_N_per_m3"]["value"] == pytest.approx(4e4, rel=0.05)
+
+
+def test_a_drag_inside_a_simulator_of_a_speed_is_found() -> None:
+    """A curve of the input was named (0.53), or nothing."""
+    rng, dt_s, rows = np.random.default_rng(99), 0.05, []
+    for force, (_, speed) in pushed(dt_s, 1200, 1.5, (1.4, 0.5, 0.0, 0.0, 0.1)):
+        reading = speed + 0.01 * rng.standard_normal(speed.size)
+        rows.append({"t": np.arange(force.size) * dt_s, "u": force, "v": reading})
+    (effect,) = sd.diagnose(rows, free_of("cart", rolling, ("u", "N"), ("v", "m/s"), damping=0.4, mass=1.0)).effects
+    assert (effect["id"], effect["port"]) == ("viscous_friction", "u_along_v")
+    assert effect["parameters"]["coefficient_N_s2_per_m2"]["value"] == pytest.approx(0.1, rel=0.05)
+
+
+def test_a_cart_whose_measured_speed_is_noisy_lacks_nothing() -> None:
+    """A linear law of the measured speed would be an observer: it takes out noise, and a negative damping was named."""
+    rng, dt_s, rows = np.random.default_rng(99), 0.05, []
+    for force, (_, speed) in pushed(dt_s, 1200, 1.5, (1.4, 0.5, 0.0, 0.0, 0.0)):
+        reading = speed + 0.02 * rng.standard_normal(speed.size)
+        rows.append({"t": np.arange(force.size) * dt_s, "u": force, "v": reading})
+    nominal = free_of("cart", rolling, ("u", "N"), ("v", "m/s"), damping=0.4, mass=1.0)
+    nominal["callable"]["forces_inside"] = True
+    assert sd.diagnose(rows, nominal).verdict == "nothing_missing"
+
+
+def free_of(name: str, function: Any, given: tuple[str, str], read: tuple[str, str], **parameters: float) -> dict[str, Any]:
+    """Nominal model of a simulator with one input and one output (name and unit), which offers nothing."""
+    return {
+        "name": name,
+        "kind": "callable",
+        "data": {"time": "t"},
+        "channels": {column: {"column": column, "unit": unit} for column, unit in (given, read)},
+        "callable": {"function": function, "inputs": [given[0]], "outputs": [read[0]]},
+        "parameters": {key: {"value": value, "low": 0.0, "high": 1000.0} for key, value in parameters.items()},
+    }
