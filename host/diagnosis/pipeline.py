@@ -33,7 +33,7 @@ from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.models.simulated import driven_along
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
-from host.diagnosis.selection.between_recordings import inadequate, root_mean_square, unlike_recordings
+from host.diagnosis.selection.between_recordings import inadequate, unlike_recordings
 from host.diagnosis.selection.corners import over_alike
 from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
 from host.diagnosis.selection.early import early_outputs
@@ -57,6 +57,7 @@ from host.diagnosis.selection.remarks import (
     noise_of_motion,
     read_seldom,
     slow_noise,
+    times_noise,
 )
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
 from host.diagnosis.selection.search import concluded, forward, search
@@ -198,23 +199,33 @@ def diagnose(
     """
     _keep_freed_memory()
     with threadpool_limits(1, "blas"):  # products of a few columns: threads that wait for each other took 4 times the work
-        budget, further = Budget(time_budget_s), _with_forces_inside(spec)
-        if further is None:
-            return _diagnosed(spec, sources, progress, left_out, rules, budget)
-        first = _diagnosed(spec, sources, _share_of(progress, 0.0, FIRST_SHARE), left_out, rules, budget)
+        budget, twice = Budget(time_budget_s), _may_have_forces_inside(spec)
+        overall = Overall(_share_of(progress, 0.0, FIRST_SHARE) if twice else progress)
+        overall.part(0.0, 0.02)("reading recordings", 0.0)
+        data = clocks_put_right(spec, inspected(spec, sources, rules), left_out, rules)
+        first = _diagnosed(spec, data, overall, left_out, rules, budget)
+        if not twice:
+            return first
         if budget.spent() or not _unexplained(first):
             progress("done", 1.0)
             return first
-        second = _diagnosed(further, sources, _share_of(progress, FIRST_SHARE, 1.0), left_out, rules, budget)
+        overall = Overall(_share_of(progress, FIRST_SHARE, 1.0))
+        second = _diagnosed(_with_forces_inside(spec), data, overall, left_out, rules, budget)
         return second if _explains_more(second, first) else first
 
 
-def _with_forces_inside(spec: NominalSpec) -> NominalSpec | None:
-    """`spec` with forces along measured motions among its simulator's candidates; None where it has or can have none."""
+def _may_have_forces_inside(spec: NominalSpec) -> bool:
+    """Whether forces along measured motions may be missing in a simulator, and are not among its candidates."""
     section, units = spec.simulator, {name: channel.unit for name, channel in spec.channels.items()}
-    if section is None or section.forces_inside or spec.kind == "linear" or not driven_along(section, units):
-        return None
-    return spec.model_copy(update={spec.kind: section.model_copy(update={"forces_inside": True})})
+    if section is None or section.forces_inside or spec.kind == "linear":
+        return False
+    return bool(driven_along(section, units))
+
+
+def _with_forces_inside(spec: NominalSpec) -> NominalSpec:
+    """`spec` with forces along measured motions among the candidates of its simulator."""
+    assert spec.simulator is not None
+    return spec.model_copy(update={spec.kind: spec.simulator.model_copy(update={"forces_inside": True})})
 
 
 def _share_of(progress: Progress, low: float, high: float) -> Progress:
@@ -223,8 +234,8 @@ def _share_of(progress: Progress, low: float, high: float) -> Progress:
 
 def _unexplained(result: Diagnosis) -> bool:
     """Whether more is left than noise, which may be a guess: a further search is worth its time."""
-    left = np.maximum(result.figures.after, root_mean_square(result.full, result.full_rate.best.residuals))
-    return result.remainder.sure or bool(np.any(left > result.full.rules.residual_over_noise * result.figures.noise_sd))
+    ratios = times_noise(result.full, result.full_rate, result.figures)
+    return result.remainder.sure or bool(np.any(ratios > result.full.rules.residual_over_noise))
 
 
 def _explains_more(second: Diagnosis, first: Diagnosis) -> bool:
@@ -250,15 +261,14 @@ def _keep_freed_memory() -> None:
 
 def _diagnosed(
     spec: NominalSpec,
-    sources: Sequence[Path | Table],
-    progress: Progress,
+    data: Inspected,
+    overall: Overall,
     left_out: frozenset[str],
     rules: SelectionRules,
     budget: Budget,
 ) -> Diagnosis:
-    overall = Overall(progress)
-    overall.part(0.0, 0.02)("reading recordings", 0.0)
-    data, done = clocks_put_right(spec, inspected(spec, sources, rules), left_out, rules), None
+    """The diagnosis of recordings that were read."""
+    done = None
     axis = spec.axis
     if axis is not None and axis.runs_away and axis.compare is None:
         by_motion = _by_motion(spec)

@@ -156,12 +156,12 @@ class SimulatedModel(Model):
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
         self.session_offsets = [name for name in (*section.inputs, *section.outputs) if spec.channels[name].session_offset]
         inputs, outputs = section.inputs, section.outputs
-        self.forced, self.chain, self.along = self._forced(), self._chain(), driven_along(section, self.units)
+        self.forced, self.chain = self._forced(), self._chain()
+        self.along = driven_along(section, self.units) if section.forces_inside else {}
         self.weighed = tuple(n for n in section.load if n in section.inputs and is_force(self.units[n]) and self.shifted)
         self.outputs = tuple(Output(name, self.units[name], self.subsystem_of(name)) for name in outputs)
-        inside = self._ports_along() if section.forces_inside else []
-        self.ports = (*self._signal_ports(), *inside, *self._offered_ports(offers))
-        self.taken |= {f"{law}@{port.name}" for law in LINEAR_LAWS for port in inside}
+        self.ports = (*self._signal_ports(), *self._offered_ports(offers))
+        self.taken |= {f"{law}@{name}" for law in LINEAR_LAWS for name in self.along}
         parameters = []
         for key, declared in spec.parameters.items():
             low, high = declared.bounds() if declared.free else (declared.value, declared.value)
@@ -213,6 +213,9 @@ class SimulatedModel(Model):
         if self.weighed:
             offers = (constant_load({name: self.units[name] for name in self.weighed}),)
             found.append(Port(WEIGHT, "weight", self.subsystem_of(self.weighed[0]), tuple(section.outputs), offers=offers))
+        for name, (force, motion) in self.along.items():
+            others = tuple(other for other in section.inputs if other != force)
+            found.append(Port(name, "force", self.subsystem_of(motion), tuple(section.outputs), loads, others, against=True))
         return found
 
     def _chain(self) -> list[tuple[str, str]]:
@@ -234,20 +237,11 @@ class SimulatedModel(Model):
             for motion in self.section.inputs
             if (wanted := FORCE_OF.get(self.units[motion])) and wanted == FORCES.get(self.units[force])
         ]
-        declared = [(a, b) for a, b in pairs if a in self.section.ports and b in self.section.ports]
-        own = [pair for pair in declared if self.subsystem_of(pair[0]) == self.subsystem_of(pair[1])]
+        own = of_one_subsystem(self.section, pairs)
         if len(pairs) > MOST_FORCED and not own:  # each force with the motion of its own place in the list
             forces, motions = (list(dict.fromkeys(names)) for names in zip(*pairs, strict=True))
             own = [pair for pair in zip(forces, motions, strict=False) if pair in pairs]
         return {f"{force}_along_{motion}": (force, motion) for force, motion in own or pairs}
-
-    def _ports_along(self) -> list[Port]:
-        section, found = self.section, []
-        for name, (force, motion) in self.along.items():
-            others = tuple(other for other in section.inputs if other != force)
-            outputs, subsystem = tuple(section.outputs), self.subsystem_of(motion)
-            found.append(Port(name, "force", subsystem, outputs, tuple(section.load), others, against=True))
-        return found
 
     def _offered_ports(self, offers: list[OfferSpec]) -> list[Port]:
         """A port for every offered parameter, with its one effect."""
@@ -560,7 +554,7 @@ class SimulatedModel(Model):
             error, best = min((_misfit(answer.to(trial), change), k) for k, answer in enumerate(answers))
             if error < TRUSTED:
                 found[name] = answers[best]
-        for place, (force, _) in self.along.items() if self.section.forces_inside else ():
+        for place, (force, _) in self.along.items():
             if force in found:
                 found[place] = replace(found[force], active=[effect for effect in active if effect[0].port.name == place])
         return found
@@ -625,6 +619,11 @@ class SimulatedModel(Model):
         )
 
 
+def of_one_subsystem(section: SimulatorSpec, pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Those of `pairs` of channels whose subsystems are both declared, and are one."""
+    return [(a, b) for a, b in pairs if a in section.ports and section.ports[a] == section.ports.get(b)]
+
+
 def driven_along(section: SimulatorSpec, units: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     """Return ports of forces inside a simulator that gets forces and predicts motions, with their input and output.
 
@@ -639,8 +638,7 @@ def driven_along(section: SimulatorSpec, units: Mapping[str, str]) -> dict[str, 
         and (units[force] in OF_A_MOTOR or FORCE_OF[place] == FORCES.get(units[force]))
     ]
     if len(pairs) > MOST_FORCED:
-        pairs = [pair for pair in pairs if all(name in section.ports for name in pair)]
-        pairs = [(a, b) for a, b in pairs if section.ports[a] == section.ports[b]]
+        pairs = of_one_subsystem(section, pairs)
     return {f"{force}_along_{motion}": (force, motion) for force, motion in pairs[:MOST_FORCED]}
 
 

@@ -117,16 +117,20 @@ def slow_noise(full: Problem, fits: FullRate, rows: list[int]) -> list[Finding]:
     return findings
 
 
+def times_noise(full: Problem, fits: FullRate, figures: Figures) -> Array:
+    """Residual over noise (outputs,), in held-out samples or in all, whichever is larger."""
+    left = np.maximum(figures.after, root_mean_square(full, fits.best.residuals))
+    return np.asarray(left / np.maximum(full.noise_sd, 1e-300))
+
+
 def larger_than_noise(full: Problem, fits: FullRate, figures: Figures) -> list[Finding]:
-    """Sentences on outputs whose residual is larger than the noise, in held-out samples or in all, and not surely so."""
-    findings = []
-    rules, everywhere = full.rules, root_mean_square(full, fits.best.residuals)
-    for row, (output, noise) in enumerate(zip(full.model.outputs, full.noise, strict=True)):
-        left = max(figures.after[row], everywhere[row])
-        if not left > rules.residual_over_noise * noise.sigma:
+    """Sentences on outputs whose residual is larger than the noise, and not surely so."""
+    findings, rules = [], full.rules
+    for output, noise, ratio in zip(full.model.outputs, full.noise, times_noise(full, fits, figures), strict=True):
+        if not ratio > rules.residual_over_noise:
             continue
         column = full.columns.get(output.channel, output.channel)
-        ratio = left / max(noise.sigma, 1e-300)
+        left = ratio * noise.sigma
         says = f"The residual of column {column}, {left:.3g} {output.unit} RMS, is {ratio:.2g} times the noise that "
         if noise.source.seen_alone:
             says += "was recorded alone. No effect explains it, and up to "

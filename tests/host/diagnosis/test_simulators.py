@@ -473,9 +473,7 @@ def rolling(inputs: dict[str, Array], p: dict[str, float], time_s: Array, start:
     return {"v": driven(inputs["u"], float(time_s[1] - time_s[0]), 0.0, start["v"], law)[1]}
 
 
-def pushed(
-    dt_s: float, samples: int, size: float, law: tuple[float, float, float, float, float]
-) -> list[tuple[Array, Array]]:
+def pushed(dt_s: float, samples: int, size: float, law: tuple[float, ...]) -> list[tuple[Array, Array]]:
     """Three forces (n,) of several tones, and the motion (2, n) each drives, cut from motion."""
     out, t = [], np.arange(samples + 200) * dt_s
     for number in range(3):
@@ -499,26 +497,27 @@ def test_a_hardening_spring_inside_a_simulator_is_found() -> None:
     assert effect["parameters"]["cubic_N_per_m3"]["value"] == pytest.approx(4e4, rel=0.05)
 
 
+def of_a_cart(drag: float, noise: float, **section: Any) -> Any:
+    """Verdict on three recordings of the speed of a cart."""
+    rng, dt_s, rows = np.random.default_rng(99), 0.05, []
+    for force, (_, speed) in pushed(dt_s, 1200, 1.5, (1.4, 0.5, 0.0, 0.0, drag)):
+        reading = speed + noise * rng.standard_normal(speed.size)
+        rows.append({"t": np.arange(force.size) * dt_s, "u": force, "v": reading})
+    nominal = free_of("cart", rolling, ("u", "N"), ("v", "m/s"), damping=0.4, mass=1.0)
+    nominal["callable"] |= section
+    return sd.diagnose(rows, nominal)
+
+
 def test_a_drag_inside_a_simulator_of_a_speed_is_found() -> None:
     """A curve of the input was named (0.53), or nothing."""
-    rng, dt_s, rows = np.random.default_rng(99), 0.05, []
-    for force, (_, speed) in pushed(dt_s, 1200, 1.5, (1.4, 0.5, 0.0, 0.0, 0.1)):
-        reading = speed + 0.01 * rng.standard_normal(speed.size)
-        rows.append({"t": np.arange(force.size) * dt_s, "u": force, "v": reading})
-    (effect,) = sd.diagnose(rows, free_of("cart", rolling, ("u", "N"), ("v", "m/s"), damping=0.4, mass=1.0)).effects
+    (effect,) = of_a_cart(0.1, 0.01).effects
     assert (effect["id"], effect["port"]) == ("viscous_friction", "u_along_v")
     assert effect["parameters"]["coefficient_N_s2_per_m2"]["value"] == pytest.approx(0.1, rel=0.05)
 
 
 def test_a_cart_whose_measured_speed_is_noisy_lacks_nothing() -> None:
     """A linear law of the measured speed would be an observer: it takes out noise, and a negative damping was named."""
-    rng, dt_s, rows = np.random.default_rng(99), 0.05, []
-    for force, (_, speed) in pushed(dt_s, 1200, 1.5, (1.4, 0.5, 0.0, 0.0, 0.0)):
-        reading = speed + 0.02 * rng.standard_normal(speed.size)
-        rows.append({"t": np.arange(force.size) * dt_s, "u": force, "v": reading})
-    nominal = free_of("cart", rolling, ("u", "N"), ("v", "m/s"), damping=0.4, mass=1.0)
-    nominal["callable"]["forces_inside"] = True
-    assert sd.diagnose(rows, nominal).verdict == "nothing_missing"
+    assert of_a_cart(0.0, 0.02, forces_inside=True).verdict == "nothing_missing"
 
 
 def free_of(name: str, function: Any, given: tuple[str, str], read: tuple[str, str], **parameters: float) -> dict[str, Any]:
