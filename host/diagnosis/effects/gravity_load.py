@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 
 from host.diagnosis.effects.sensor_bias import apply as shifted
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
@@ -109,17 +112,30 @@ def payload_torques(moved: Array, c: Context | None, p: Array, form: str) -> Arr
     link, and the absolute angle at which the first joint reads zero, from hanging down. Equation: with absolute angles th,
     tau_j = m sum_{k>=j} l_k (g sin th_k + sum_i l_i (cos(th_k - th_i) th_i'' + sin(th_k - th_i) th_i'^2)).
     """
-    angle, rate, acceleration = np.cumsum(moved, axis=0).transpose(1, 0, 2)
-    angle = angle + p[-1]
-    links = angle.shape[0]
-    at = np.zeros_like(angle)
-    for k in range(links):
-        pull = GRAVITY_M_PER_S2 * np.sin(angle[k])
-        for i in range(links):
-            between = angle[k] - angle[i]
-            pull = pull + p[1 + i] * (np.cos(between) * acceleration[i] + np.sin(between) * rate[i] ** 2)
-        at[k] = p[0] * p[1 + k] * pull
-    return np.asarray(np.cumsum(at[::-1], axis=0)[::-1])
+    return _payload(np.ascontiguousarray(moved), p)
+
+
+@njit(cache=True)
+def _payload(moved: Array, p: Array) -> Array:
+    """`payload_torques`; sines of the differences of two angles are made of those of the angles."""
+    links, n = moved.shape[0], moved.shape[2]
+    out = np.zeros((links, n))
+    sine, cosine, rate, acceleration = np.empty(links), np.empty(links), np.empty(links), np.empty(links)
+    for s in range(n):
+        angle, first, second = p[1 + links], 0.0, 0.0
+        for k in range(links):
+            angle, first, second = angle + moved[k, 0, s], first + moved[k, 1, s], second + moved[k, 2, s]
+            sine[k], cosine[k], rate[k], acceleration[k] = math.sin(angle), math.cos(angle), first, second
+        total = 0.0
+        for k in range(links - 1, -1, -1):
+            pull = GRAVITY_M_PER_S2 * sine[k]
+            for i in range(links):
+                along = cosine[k] * cosine[i] + sine[k] * sine[i]
+                across = sine[k] * cosine[i] - cosine[k] * sine[i]
+                pull += p[1 + i] * (along * acceleration[i] + across * rate[i] * rate[i])
+            total += p[0] * p[1 + k] * pull
+            out[k, s] = total
+    return out
 
 
 _TURNING = Effect(

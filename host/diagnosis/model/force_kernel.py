@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -111,23 +112,75 @@ SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which 
 FOOT = 1.0 / (math.sqrt(10.0) - 1.0)  # of a parabola before its height is 0.1, in the time it takes from there to 1
 
 
+class SmoothLaw(NamedTuple):
+    """The smooth force terms of a parameter array, read once: the solver evaluates them many times in each sample."""
+
+    damping: float
+    drag: float
+    asymmetry: float
+    quadratic: float
+    cubic: float
+    constant: float
+    branch: float  # stiffness of the Maxwell branch
+    softening: float  # of the stiffness, over time
+    stiffness: float  # that a gap takes away
+    gap: float
+    amplitude: float  # of the force that is periodic over the place or over time: amplitude*sin(... + phase)
+    phase: float
+    per_place: float
+    per_time: float
+    moment: float  # of a weight that turns: moment*sin(x + lean)
+    lean: float
+    contact_place: float
+    contact_exponent: float
+    contact_stiffness: float
+    contact_damping: float
+
+
 @njit(cache=True)
-def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
+def smooth_law(p: Array) -> SmoothLaw:
+    """The terms of `smooth_force` in the parameter array `p`."""
+    return SmoothLaw(
+        p[VISCOUS],
+        p[DRAG],
+        p[ASYMMETRY],
+        p[QUADRATIC],
+        p[CUBIC],
+        p[CONSTANT],
+        p[MAXWELL_K],
+        p[SOFTENING] * p[STIFFNESS],
+        p[STIFFNESS],
+        p[GAP],
+        math.hypot(p[SINE], p[COSINE]),
+        math.atan2(p[COSINE], p[SINE]),
+        TWO_PI / p[PITCH] if p[PITCH] > 0.0 else 0.0,
+        TWO_PI * p[FREQUENCY] if p[FREQUENCY] > 0.0 else 0.0,
+        math.hypot(p[MOMENT_S], p[MOMENT_C]),
+        math.atan2(p[MOMENT_C], p[MOMENT_S]),
+        p[CONTACT_X],
+        p[CONTACT_N],
+        p[CONTACT_K],
+        p[CONTACT_C],
+    )
+
+
+@njit(cache=True)
+def smooth_force(x: float, v: float, t: float, slow: float, law: SmoothLaw) -> float:
     """Force without dry friction: against the motion, to be overcome by the input. `slow`: x after the lag of the
     Maxwell branch.
     """
-    force = p[VISCOUS] * v + p[DRAG] * v * abs(v) + p[ASYMMETRY] * abs(v) + p[QUADRATIC] * x * x + p[CUBIC] * x * x * x
-    force += p[CONSTANT] + p[MAXWELL_K] * (x - slow) + p[SOFTENING] * t * p[STIFFNESS] * x
-    force -= p[STIFFNESS] * min(max(x, -p[GAP]), p[GAP])
-    if p[PITCH] > 0.0:
-        force += p[SINE] * math.sin(TWO_PI * x / p[PITCH]) + p[COSINE] * math.cos(TWO_PI * x / p[PITCH])
-    if p[FREQUENCY] > 0.0:
-        force += p[SINE] * math.sin(TWO_PI * t * p[FREQUENCY]) + p[COSINE] * math.cos(TWO_PI * t * p[FREQUENCY])
-    if p[MOMENT_S] != 0.0 or p[MOMENT_C] != 0.0:
-        force += p[MOMENT_S] * math.sin(x) + p[MOMENT_C] * math.cos(x)
-    depth = x - p[CONTACT_X]
-    if p[CONTACT_N] > 0.0 and depth > 0.0:
-        force += depth ** p[CONTACT_N] * (p[CONTACT_K] + p[CONTACT_C] * v)
+    force = (law.damping + law.drag * abs(v)) * v + law.asymmetry * abs(v) + (law.quadratic + law.cubic * x) * x * x
+    force += law.constant + law.branch * (x - slow) + law.softening * t * x
+    force -= law.stiffness * min(max(x, -law.gap), law.gap)
+    if law.per_place > 0.0:
+        force += law.amplitude * math.sin(law.per_place * x + law.phase)
+    if law.per_time > 0.0:
+        force += law.amplitude * math.sin(law.per_time * t + law.phase)
+    if law.moment != 0.0:
+        force += law.moment * math.sin(x + law.lean)
+    depth = x - law.contact_place
+    if law.contact_exponent > 0.0 and depth > 0.0:
+        force += depth**law.contact_exponent * (law.contact_stiffness + law.contact_damping * v)
     return force
 
 
@@ -273,7 +326,7 @@ def along(
     """Force of all terms along a measured motion x, v, a (n,)."""
     out = np.empty(x.size)
     z = np.zeros(6)
-    rest = start_state(z, start, load[0], p)
+    rest, law = start_state(z, start, load[0], p), smooth_law(p)
     dry = p[COULOMB] != 0.0 or p[EXCESS] != 0.0
     side = sides(x, tolerance) if dry and p[STRIBECK_D] <= 0.0 else z
     slow = x[0] - relaxed_by(start, p)
@@ -284,7 +337,7 @@ def along(
     for i in range(x.size):
         dx = x[i] - x[i - 1] if i > 0 else 0.0
         slow = x[i] + (slow - x[i]) * decay
-        out[i] = smooth_force(x[i], v[i], t[i], slow, p) + hysteresis(z, dx, v[i], load[i], p)
+        out[i] = smooth_force(x[i], v[i], t[i], slow, law) + hysteresis(z, dx, v[i], load[i], p)
         out[i] += _rising(v[i], load[i], p) + p[ADDED_MASS] * a[i]
         if dry and p[STRIBECK_D] <= 0.0:
             out[i] += level_at(v[i], p) * (side[i] if side[i] != 0.0 else rest)
@@ -297,38 +350,85 @@ def along(
     return out
 
 
+class ForcedAxis(NamedTuple):
+    """What moves an axis, without its dry friction. The second mass is one over that of the axis."""
+
+    mass: float
+    damping: float
+    stiffness: float
+    second_mass: float
+    second_stiffness: float  # over the second mass, as is its damping
+    second_damping: float
+    law: SmoothLaw
+    powers: tuple[float, float, float, float, float, float]  # as `_pull` wants them
+    short: bool  # whether these powers are all there is
+
+
 @njit(cache=True)
-def _accelerations(
-    x: float, v: float, x2: float, v2: float, u: float, t: float, slow: float, linear: Array, p: Array
-) -> tuple[float, float]:
-    """Accelerations of the axis and of the second mass; `u` with offset and held friction."""
-    force = u - linear[1] * v - linear[2] * x - smooth_force(x, v, t, slow, p)
-    pull = 0.0
-    if p[MASS2] > 0.0:
-        pull = p[OMEGA2] * p[OMEGA2] * (x - x2) + 2.0 * p[DAMPING2] * p[OMEGA2] * (v - v2)
-        force -= p[MASS2] * linear[0] * pull
-    return force / linear[0], pull
+def _axis_of(linear: Array, p: Array) -> ForcedAxis:
+    """The axis of the nominal parameters `linear` (m, c, k, offset) and the parameter array `p`."""
+    m, c, k = linear[0], linear[1], linear[2]
+    q = ((c + p[VISCOUS]) / m, p[DRAG] / m, p[ASYMMETRY] / m, k / m, p[QUADRATIC] / m, p[CUBIC] / m)
+    k2, c2 = p[OMEGA2] * p[OMEGA2], 2.0 * p[DAMPING2] * p[OMEGA2]
+    return ForcedAxis(m, c, k, p[MASS2], k2, c2, smooth_law(p), q, polynomial(p))
 
 
 @njit(cache=True)
 def _runge_kutta(
+    x: float,
+    v: float,
+    u: tuple[float, float, float],
+    t: float,
+    h: float,
+    slow: float,
+    axis: ForcedAxis,
+) -> tuple[float, float, float]:
+    """One step of (x, v); the last item is the acceleration at its start."""
+    less, c, k, law = 1.0 / axis.mass, axis.damping, axis.stiffness, axis.law
+    a1 = less * (u[0] - c * v - k * x - smooth_force(x, v, t, slow, law))
+    x2, v2 = x + 0.5 * h * v, v + 0.5 * h * a1
+    a2 = less * (u[1] - c * v2 - k * x2 - smooth_force(x2, v2, t + 0.5 * h, slow, law))
+    x3, v3 = x + 0.5 * h * v2, v + 0.5 * h * a2
+    a3 = less * (u[1] - c * v3 - k * x3 - smooth_force(x3, v3, t + 0.5 * h, slow, law))
+    x4, v4 = x + h * v3, v + h * a3
+    a4 = less * (u[2] - c * v4 - k * x4 - smooth_force(x4, v4, t + h, slow, law))
+    return x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4), v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4), a1
+
+
+@njit(cache=True)
+def _accelerations(
+    s: tuple[float, float, float, float],
+    u: float,
+    t: float,
+    slow: float,
+    axis: ForcedAxis,
+) -> tuple[float, float]:
+    """Accelerations of the axis and of the second mass; `u` with offset and held friction."""
+    pull = axis.second_stiffness * (s[0] - s[2]) + axis.second_damping * (s[1] - s[3])
+    force = u - axis.damping * s[1] - axis.stiffness * s[0] - smooth_force(s[0], s[1], t, slow, axis.law)
+    return force / axis.mass - axis.second_mass * pull, pull
+
+
+@njit(cache=True)
+def _two_masses(
     s: tuple[float, float, float, float],
     u: tuple[float, float, float],
     t: float,
     h: float,
     slow: float,
-    linear: Array,
-    p: Array,
+    axis: ForcedAxis,
 ) -> tuple[float, float, float, float, float]:
-    """One step of (x, v, x2, v2); the last item is the acceleration at its start."""
+    """`_runge_kutta` with a second mass: one step of (x, v, x2, v2); the last item is the acceleration at its start."""
     x, v, y, w = s
-    a1, b1 = _accelerations(x, v, y, w, u[0], t, slow, linear, p)
+    a1, b1 = _accelerations(s, u[0], t, slow, axis)
     v2, w2 = v + 0.5 * h * a1, w + 0.5 * h * b1
-    a2, b2 = _accelerations(x + 0.5 * h * v, v2, y + 0.5 * h * w, w2, u[1], t + 0.5 * h, slow, linear, p)
+    s2 = (x + 0.5 * h * v, v2, y + 0.5 * h * w, w2)
+    a2, b2 = _accelerations(s2, u[1], t + 0.5 * h, slow, axis)
     v3, w3 = v + 0.5 * h * a2, w + 0.5 * h * b2
-    a3, b3 = _accelerations(x + 0.5 * h * v2, v3, y + 0.5 * h * w2, w3, u[1], t + 0.5 * h, slow, linear, p)
+    s3 = (x + 0.5 * h * v2, v3, y + 0.5 * h * w2, w3)
+    a3, b3 = _accelerations(s3, u[1], t + 0.5 * h, slow, axis)
     v4, w4 = v + h * a3, w + h * b3
-    a4, b4 = _accelerations(x + h * v3, v4, y + h * w3, w4, u[2], t + h, slow, linear, p)
+    a4, b4 = _accelerations((x + h * v3, v4, y + h * w3, w4), u[2], t + h, slow, axis)
     return (
         x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4),
         v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4),
@@ -375,6 +475,22 @@ def _short_step(
     v4 = v + h * a3
     a4 = u2 + _pull(x + h * v3, v4, q)
     return x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4), v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4), a1
+
+
+@njit(cache=True)
+def _step(
+    s: tuple[float, float, float, float], u: tuple[float, float, float], t: float, h: float, slow: float, axis: ForcedAxis
+) -> tuple[float, float, float, float, float]:
+    """One step of (x, v, x2, v2) without dry friction, at no more cost than the forces need; the last item is the
+    acceleration at its start.
+    """
+    if axis.short:
+        x, v, a = _short_step(s[0], s[1], u[0] / axis.mass, u[1] / axis.mass, u[2] / axis.mass, h, axis.powers)
+        return x, v, x, v, a
+    if axis.second_mass > 0.0:
+        return _two_masses(s, u, t, h, slow, axis)
+    x, v, a = _runge_kutta(s[0], s[1], u, t, h, slow, axis)
+    return x, v, x, v, a
 
 
 @njit(cache=True)
@@ -487,11 +603,11 @@ def run_axis(
     held, slow = hysteresis(z, 0.0, begin[1], load[0], p), begin[0] - relaxed_by(start, p)
     decay = math.exp(-h / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
     previous, drive = begin[0], 0.0
-    short = polynomial(p)
-    q = ((linear[1] + p[VISCOUS]) / m, p[DRAG] / m, p[ASYMMETRY] / m, linear[2] / m, p[QUADRATIC] / m, p[CUBIC] / m)
+    axis = _axis_of(linear, p)
     if not control.size and _linear(p):
-        return _run_linear(u, substeps, h, offset - p[CONSTANT], m, q, begin)
+        return _run_linear(u, substeps, h, offset - p[CONSTANT], m, axis.powers, begin)
     remembers = p[PRESLIDING] != 0.0 or p[LOAD] != 0.0 or p[STRIBECK_D] > 0.0
+    rises = p[SMOOTH_SPEED] > 0.0 or p[LOAD_SMOOTH_SPEED] > 0.0
     for i in range(n):
         if control.size:
             drive = (
@@ -507,28 +623,26 @@ def run_axis(
         if p[DRIVE_LIMIT] > 0.0:
             drive = min(max(drive, -p[DRIVE_LIMIT]), p[DRIVE_LIMIT])
         for j in range(substeps):
-            more = offset - held - (p[CONSTANT] if short else 0.0)
+            more = offset - held - (p[CONSTANT] if axis.short else 0.0)
             push = (
                 (drive + more, drive + more, drive + more)
                 if control.size
                 else (u[i, j, 0] + more, u[i, j, 1] + more, u[i, j, 2] + more)
             )
             # Half the impulse of friction that rises with speed before the step, half after it (Strang 1968).
-            s = (s[0], _slowed_by_rising(s[1], load[i], 0.5 * h / m, p), s[2], s[3])
+            if rises:
+                s = (s[0], _slowed_by_rising(s[1], load[i], 0.5 * h / m, p), s[2], s[3])
             x_old, v_old = s[0], s[1]
             dry = level_at(v_old, p) if p[STRIBECK_D] <= 0.0 else 0.0
-            if short:
-                x, v, a = _short_step(x_old, v_old, push[0] / m, push[1] / m, push[2] / m, h, q)
-                x2, v2 = x, v
-            else:
-                x, v, x2, v2, a = _runge_kutta(s, push, begin_s + i * dt_s + j * h, h, slow, linear, p)
+            x, v, x2, v2, a = _step(s, push, begin_s + i * dt_s + j * h, h, slow, axis)
             if j == 0:
                 out[2, i] = a - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(a, -dry / m), dry / m)))
                 out[2, i] -= _rising(v_old, load[i], p) / m
             if dry > 0.0:
                 v, further, stuck = _dry(v_old, v, a, dry, h, m)
                 x = x_old if stuck else x + further
-            v = _slowed_by_rising(v, load[i], 0.5 * h / m, p)
+            if rises:
+                v = _slowed_by_rising(v, load[i], 0.5 * h / m, p)
             s = (x, v, x2, v2)
             slow = x + (slow - x) * decay
             if remembers:
