@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -114,6 +114,54 @@ def _split(values: Array) -> int:
     total = np.cumsum(values)
     gain = total[:-1] ** 2 / first + (total[-1] - total[:-1]) ** 2 / (n - first)
     return int(np.argmax(gain)) + 1
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Steps lost at one instant of one recording. size: what was lost, in the unit of the port."""
+
+    recording: str
+    instant: float
+    clock: str  # unit of the instant: s, or samples
+    size: float
+    unit: str
+    fitted: bool  # whether samples to fit show its size
+
+    @property
+    def key(self) -> str:
+        """Name of the step's course among those that a recording holds for effects."""
+        return f"lost {self.recording} {self.instant!r}"
+
+
+def own_losses(losses: tuple[Loss, ...]) -> Effect:
+    """Return the effect of steps that each recording loses at instants of its own, `losses`.
+
+    The courses of the steps, each from 0 to 1, are laid out in the recordings (`Context.equations`). Sizes of those that are
+    held out are not among the parameters: their courses have the size that these samples show.
+    """
+    fitted = [loss for loss in losses if loss.fitted]
+    heldout = [loss for loss in losses if not loss.fitted]
+
+    def own(s: Scale, form: str) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f"jump_{k}", s.unit, (loss.size,), linear=True) for k, loss in enumerate(fitted, 1))
+
+    def moved(signal: Array, c: Context, p: Array, form: str) -> Array:
+        nothing = np.zeros(1)
+        for size, loss in zip([*p, *np.ones(len(heldout))], [*fitted, *heldout], strict=True):
+            signal = signal + size * c.equations.get(loss.key, nothing)
+        return np.asarray(signal)
+
+    places = [f"{{jump_{k}}} at {_instant(loss)}" for k, loss in enumerate(fitted, 1)]
+    places += [f"about {loss.size:.3g} {loss.unit} at {_instant(loss)}" for loss in heldout]
+    says = f"The axis lost {', '.join(places)}, and did not recover them. A sensor that was moved looks the same."
+    equation = "y = x + sum_k jump_k*(t > instant_k), in each recording its own"
+    effect = Effect("missed_steps", "motion", 10, own, says, equation, moved, timed=True, forms=("own",))
+    return replace(effect, searched=True, dated=True, several=True)
+
+
+def _instant(loss: Loss) -> str:
+    name = loss.recording.replace("{", "{{").replace("}", "}}")
+    return f"{loss.instant:.4g} {loss.clock} of {name}"
 
 
 EFFECTS = tuple(

@@ -78,6 +78,9 @@ def extended(result: Diagnosis) -> tuple[Array, list[ActiveEffect]]:
     theta, active = result.problem.parted(best.terms, best.values)
     if isinstance(result.model, Known):
         active, theta = result.model.with_known(theta, active), theta[: result.model.own]
+    dated = [candidate.key for candidate, _ in active if candidate.effect.dated]
+    if dated:
+        raise InputError("--export", f"{dated[0]}, events at instants of these recordings", "effects of every recording")
     searched = [candidate.key for candidate, _ in active if candidate.effect.searched]
     if searched:
         raise InputError("--export", f"{searched[0]}, an equation found by search", "effects of the vocabulary")

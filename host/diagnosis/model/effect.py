@@ -162,6 +162,7 @@ class Effect:
     listed: bool = True  # of the vocabulary
     extended: bool = False  # the vocabulary's effect is a narrower law: an equation outside it would say the same
     searched: bool = False  # an equation of recorded signals: it says nothing of a motion that was not recorded
+    dated: bool = False  # its events belong to the recordings they were seen in: no other one says anything of them
     dissipates: bool = False  # its linear parameters are friction: none is negative, whichever way an output counts
     family: str = ""  # of one family only one acts at a port: the second takes the place of the first
     remembers: bool = False  # its state at a recording's first sample is not known: it is estimated

@@ -121,6 +121,8 @@ def next_step(result: Diagnosis) -> str:
     if unsure:
         shown = words(unsure[0]["id"])
         return f"Record a further motion that shows {shown}, and diagnose again: the verdict is not confident yet."
+    if any(term.candidate.effect.dated for term in result.found.best.terms):
+        return "Home the axis that lost steps, find its load, speed and current at these instants, and record again."
     if named:
         return "Add the effects to the nominal model (the report has the lines), and check it on a new recording."
     undecided = sorted((f for f in result.findings if f.id in UNDECIDED), key=lambda f: UNDECIDED.index(f.id))

@@ -47,7 +47,7 @@ def standings(problem: Problem, found: Found) -> list[Standing]:
         gain = problem.gain("heldout", less.residuals, found.best.residuals)
         both = problem.gain("both", less.residuals, found.best.residuals)
         crossed = unexcited(problem, less, found.best, term.fitted, gain)
-        gain = crossed or gain
+        gain = both if term.candidate.effect.dated else crossed or gain
         alike, rivals = _equals(problem, found, term.candidate, less, both)
         said = _better_said(problem, found, term.candidate, less, both)
         alike += tuple(candidate for candidate, _ in said if candidate.name != term.candidate.name)

@@ -26,6 +26,7 @@ from host.diagnosis.selection.corners import round_corners
 from host.diagnosis.selection.folds import with_other_recordings
 from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.joint import PairFit, best_pair, pair_first, pair_instead
+from host.diagnosis.selection.lost_steps import lost_steps, without_lost_steps
 from host.diagnosis.selection.refits import fit_nominal, fit_without, refined, settled, try_fit
 from host.diagnosis.selection.removal import drop_unsure, drop_unsure_events, prune, reduce
 from host.diagnosis.selection.restart import hidden
@@ -68,6 +69,12 @@ def concluded(problem: Problem, found: Found, candidate_effects: list[Candidate]
     """Pairs, detours, exchanges and removals after `forward`: the second part of `search`."""
     _join(problem, found, candidate_effects, progress)
     found = _detour(problem, found, candidate_effects, progress)
+    _finish(problem, found, candidate_effects, progress)
+    return _past_lost_steps(problem, found, candidate_effects, progress)
+
+
+def _finish(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> None:
+    """Exchanges, simpler shapes and removals, once no further effect earns its place."""
     _exchange(problem, found, candidate_effects, progress)
     if len(found.best.terms) > 1:
         reduce(problem, found)
@@ -76,6 +83,39 @@ def concluded(problem: Problem, found: Found, candidate_effects: list[Candidate]
     round_corners(problem, found)
     drop_unsure_events(problem, found, candidate_effects)
     drop_unsure(problem, found)
+
+
+def _past_lost_steps(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> Found:
+    """The search from steps on that each recording lost at its own instants, where that ends better than `found`.
+
+    No effect of a law explains them, and as long as they are in the residual they hide what else is missing. What else is
+    missing hides them as well: they are looked for past each of the effects that were tried first, too.
+    """
+    if problem.budget.spent():
+        return found
+    begun, scale = get_starts(problem), problem.scale.copy()
+    tried = found.steps[0].trials if found.steps else []
+    bases = [(found.nominal, begun), *((trial.fit, trial.starts) for trial in tried[: problem.rules.joint_first])]
+    paths = []
+    for base, starts in [*bases, *([(found.best, begun)] if found.best.terms else [])]:
+        set_starts(problem, starts)
+        lost = lost_steps(problem, without_lost_steps(problem, base), candidate_effects)
+        if lost is not None:
+            paths.append((_total(problem, found.nominal, lost.trial.fit), lost))
+    set_starts(problem, begun)
+    if not paths:
+        return found
+    lost = max(paths, key=lambda path: path[0])[1]
+    first = Step(SearchMove.FORWARD, lost.trial.candidate.key, lost.trial.heldout, [lost.trial, *tried])
+    other = Found(found.nominal, _taken(problem, lost.trial), [first], lost.forms)
+    earned = problem.gain("both", found.nominal.residuals, other.best.residuals).log_likelihood
+    _grow(problem, other, candidate_effects, earned, progress)
+    _finish(problem, other, candidate_effects, progress)
+    if any(term.candidate.effect.dated for term in other.best.terms) and (
+        not found.best.terms or _ahead(problem, other, found)
+    ):
+        return other
+    _put_back(problem, found, begun, scale)
     return found
 
 
@@ -306,12 +346,17 @@ def _detour(problem: Problem, found: Found, candidate_effects: list[Candidate], 
             _grow(problem, other, candidate_effects, earned, progress)
             if likelier or _ahead(problem, other, best):
                 best, begun, scale = other, get_starts(problem), problem.scale.copy()
+    _put_back(problem, best, begun, scale)
+    return best
+
+
+def _put_back(problem: Problem, found: Found, begun: list[dict[str, float]], scale: Array) -> None:
+    """Memories, weights and initial states as `found` has them."""
     set_starts(problem, begun)
     problem.scale[:] = scale
     for segment in problem.segments:
         segment.weight = problem.scale
-    start_again(problem, best.best)
-    return best
+    start_again(problem, found.best)
 
 
 def _ahead(problem: Problem, other: Found, best: Found) -> bool:
@@ -358,6 +403,8 @@ def _exchange(problem: Problem, found: Found, candidate_effects: list[Candidate]
         for term in found.best.terms:
             if term not in found.best.terms:
                 continue  # it left with another of its name (several jumps at one port), which was exchanged
+            if term.candidate.effect.dated:
+                continue  # no law has its instants
             if (len(found.best.terms) > 1 or _frequencies(found.best, term)) and not problem.budget.spent():
                 _in_place_of(problem, found, term, candidate_effects, progress)
         found.best = prune(problem, found.best, found.steps)
