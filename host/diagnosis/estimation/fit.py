@@ -19,6 +19,7 @@ from host.diagnosis.model.model import ActiveEffect, Begin, Model, Segment
 Array = npt.NDArray[np.float64]
 RAN_AWAY = 1e12  # residual, in units of noise, beyond which a simulation has run away
 HUBER = 4.0  # residuals beyond this many scales pull with constant force
+ENDLESS = 1e150  # output of a simulation that ran away: its square is still a number
 FAR = 1e6  # residual, in units of noise, at which those of a fit are cut
 LARGEST_AMPLITUDE = 1000.0  # of an effect, in natural sizes
 BEGIN = "begin:"  # key of a state that a recording begins from, among its starts of memory
@@ -117,10 +118,7 @@ class Problem:
 
         Where a sensor is read more seldom than it is logged, its simulated readings are repeated as the recorded ones are.
         """
-        found = [
-            np.where(np.abs(out) < 1e150, out, 1e150)
-            for out in self.model.simulate_all(segments, *self.parted(terms, values))
-        ]
+        found = [_bounded(out) for out in self.model.simulate_all(segments, *self.parted(terms, values))]
         for segment, out in zip(segments, found, strict=True):
             for row, places in segment.repeats.items():
                 out[row] = out[row, places]
@@ -139,9 +137,12 @@ class Problem:
         """Dead time of all terms together (s)."""
         return sum(max(float(value), 0.0) for p, value in zip(self.parameters(terms), values, strict=True) if p.dead_time)
 
-    def unseen(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> int:
-        """First samples (number) that a dead time makes of what was before the recording: nothing can predict them."""
-        late_s = max(self.late_s(terms, values), self.waits_s)
+    def unseen(self, segment: Segment, terms: tuple[Term, ...], values: Array, dead_s: float | None = None) -> int:
+        """First samples (number) that a dead time makes of what was before the recording: nothing can predict them.
+
+        dead_s: `late_s` of these terms, where it is known already.
+        """
+        late_s = max(self.late_s(terms, values) if dead_s is None else dead_s, self.waits_s)
         late = math.ceil(late_s / segment.recording.dt_s - 1e-9) + segment.spread  # a test function reaches so far back
         return min(late, segment.n // 2) if late_s > 0.0 else 0
 
@@ -182,8 +183,9 @@ class Problem:
         """
         rows = []
         used = [segment for segment in self.segments if segment.fit.any()]
+        dead_s = self.late_s(terms, values)
         for segment, out in zip(used, self.simulate_all(used, terms, values), strict=True):
-            first = self.unseen(segment, terms, values)
+            first = self.unseen(segment, terms, values, dead_s)
             last = segment.n - self.ends(segment, terms, values)
             rows.append(_weighted(segment.y, np.ascontiguousarray(out), segment.fit, self.scale, first, last, unseen))
         return np.concatenate(rows)
@@ -194,6 +196,16 @@ class Problem:
         hidden = sum(int(segment.fit[: self.unseen(segment, terms, values)].sum()) for segment in used)
         hidden += sum(int(segment.fit[segment.n - self.ends(segment, terms, values) :].sum()) for segment in used)
         return 1.0 - hidden / max(sum(int(segment.fit.sum()) for segment in used), 1)
+
+
+@njit(cache=True)
+def _bounded(out: Array) -> Array:
+    """`out` (outputs, n) with a large number wherever the simulation ran away, or gave no number."""
+    found = np.empty(out.shape)
+    for row in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            found[row, i] = out[row, i] if abs(out[row, i]) < ENDLESS else ENDLESS
+    return found
 
 
 @njit(cache=True, error_model="numpy")

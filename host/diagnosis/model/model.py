@@ -230,8 +230,9 @@ def apply_effects(
     if not here:
         return signal
     motion = signal if before_gain is None else before_gain
-    span = float(np.ptp(motion)) or 1.0
-    tolerance = segment.tolerances.get(port, 1e-3 * span)
+    tolerance = segment.tolerances.get(port)
+    if tolerance is None:
+        tolerance = 1e-3 * (float(np.ptp(motion)) or 1.0)
     for candidate, values in sorted(here, key=lambda effect: effect[0].effect.order):
         if kind is not None and candidate.effect.port != kind:
             continue

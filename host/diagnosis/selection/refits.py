@@ -40,7 +40,7 @@ def fit_nominal(problem: Problem) -> Fit:
         fit = minimize(problem, (), fit.values, states=True)
     fit = settled(problem, begun_again(problem, fit))
     fed = find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs, problem.rules)
-    problem.noise_fed = fed and _at_noise(problem, fit)
+    problem.noise_fed = fed and _over_own_noise(problem, fit) < problem.rules.residual_over_noise_nominal**2
     problem.noise_passed = _of_inputs(problem, fit)
     return fit
 
@@ -129,14 +129,25 @@ def _of_inputs(problem: Problem, fit: Fit) -> float:
     return float(np.max(np.minimum(passed / np.maximum(residual, 1e-300), 1.0)))
 
 
-def _at_noise(problem: Problem, fit: Fit) -> bool:
-    """Whether a fit leaves no more than noise of the model's own differences can be, in all recordings together."""
+def _over_own_noise(problem: Problem, fit: Fit) -> float:
+    """Squared residual of a fit over that of the noise which the model's own differences make, in all recordings together;
+    infinite for a model that makes no differences.
+    """
     ratios = []
     for segment, residual in zip(problem.segments, fit.residuals, strict=True):
         noise = problem.model.noise_of(segment)
         if noise is not None:
             ratios.append(float(np.nanmean(residual**2)) / noise.sigma**2)
-    return bool(ratios) and float(np.mean(ratios)) < problem.rules.residual_over_noise_nominal**2
+    return float(np.mean(ratios)) if ratios else np.inf
+
+
+def _cancellable(problem: Problem, base: Fit) -> float:
+    """Share of what `base` leaves that is noise which a linear law with memory can cancel.
+
+    A law that amplifies what is fast in a force makes noise of the differences smaller. Where nothing but noise is left, all
+    that it takes may be that.
+    """
+    return 1.0 if _over_own_noise(problem, base) < 1.0 else problem.noise_passed
 
 
 def try_fit(problem: Problem, base: Fit, item: Screened) -> Trial:
@@ -178,7 +189,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened) -> Trial:
         problem.rules,
         problem.apart,
         any(segment.repeats for segment in problem.segments),
-        problem.noise_passed if fit.terms[-1].candidate.effect.cancels_noise else 0.0,
+        _cancellable(problem, base) if fit.terms[-1].candidate.effect.cancels_noise else 0.0,
     )
 
 

@@ -418,7 +418,7 @@ def _scan(base: Base, term: Term) -> list[Point]:
         size = np.sqrt(np.maximum(np.diag(G), 1e-300))
         if not np.all(np.isfinite(G)) or float(np.max(np.diag(G) / (np.sum(D * D, axis=1) + 1e-300))) < ABSORBED:
             continue
-        a = np.linalg.lstsq(G / np.outer(size, size), g / size, rcond=1e-10)[0] / size
+        a = _solved(G / np.outer(size, size), g / size) / size
         if linear:
             a = np.clip(a, -LARGEST, LARGEST)
             a = np.array(
@@ -433,6 +433,11 @@ def _scan(base: Base, term: Term) -> list[Point]:
             most_taken, left = taken, r - (a @ D - Q @ (B.T @ a))
         points.append(Point(taken, starts(term, amplitude, point), left, None, S.shape[1]))
     return points
+
+
+def _solved(G: Array, g: Array) -> Array:
+    """Least squares by normal equations of unit diagonal."""
+    return g if g.size == 1 else np.asarray(np.linalg.lstsq(G, g, rcond=1e-10)[0])
 
 
 def _known(base: Base, terms: tuple[Term, ...], trial: Array) -> Array:

@@ -67,13 +67,14 @@ def judged(name: str) -> real.SetResult:
     return real.judged(SETS[name], FOLDER)
 
 
-@pytest.mark.parametrize("seal", ["oring", "pk"])
+@pytest.mark.parametrize("seal", ["oring", pytest.param("pk", marks=pytest.mark.long)])
 def test_friction_of_a_seal_grows_with_pressure(seal: str) -> None:
     result = judged(f"pneumatic {seal}")
     assert result.named[0] == "load_dependent_friction" and "stribeck_friction" not in result.named
     assert result.after < result.hand
 
 
+@pytest.mark.long
 def test_friction_of_the_smoothest_seal() -> None:
     result = judged("pneumatic kdn")
     assert result.right and "stribeck_friction" not in result.named
