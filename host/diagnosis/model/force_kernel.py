@@ -57,6 +57,8 @@ SLOTS = (
     "constant",
     "load_zero",
     "added_mass",
+    "smooth_excess",
+    "smooth_stribeck",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -106,6 +108,8 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     CONSTANT,
     LOAD_ZERO,
     ADDED_MASS,
+    SMOOTH_EXCESS,
+    SMOOTH_STRIBECK,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
@@ -191,9 +195,16 @@ def level_at(v: float, p: Array) -> float:
 
 
 @njit(cache=True)
+def _smooth_level(v: float, p: Array) -> float:
+    """Level at speed v of the friction without a corner: that of Coulomb, and what it has more at low speed."""
+    excess = p[SMOOTH_EXCESS] * math.exp(-((v / p[SMOOTH_STRIBECK]) ** 2)) if p[SMOOTH_STRIBECK] > 0.0 else 0.0
+    return p[SMOOTH] + excess
+
+
+@njit(cache=True)
 def _rising(v: float, load: float, p: Array) -> float:
     """Friction at speed v of the laws that rise with speed, one of which follows the load; nothing where there is none."""
-    force = p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
+    force = _smooth_level(v, p) * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
     if p[LOAD_SMOOTH_SPEED] > 0.0:
         force += p[LOAD_SMOOTH] * abs(load - p[LOAD_ZERO]) * math.tanh(v / p[LOAD_SMOOTH_SPEED])
     return force
@@ -230,7 +241,7 @@ def _slowed(v_free: float, lost: float, rise: float) -> float:
 @njit(cache=True)
 def _slowed_by_rising(v_free: float, load: float, h_over_m: float, p: Array) -> float:
     """Speed after the laws that rise with speed (`_rising`) have acted over one step, one after the other."""
-    v = _slowed(v_free, h_over_m * p[SMOOTH], p[SMOOTH_SPEED])
+    v = _slowed(v_free, h_over_m * _smooth_level(v_free, p), p[SMOOTH_SPEED])
     return _slowed(v, h_over_m * p[LOAD_SMOOTH] * abs(load - p[LOAD_ZERO]), p[LOAD_SMOOTH_SPEED])
 
 

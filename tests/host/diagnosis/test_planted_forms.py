@@ -283,3 +283,48 @@ def test_the_amount_of_a_friction_without_a_corner(law: str, follows: bool) -> N
     amount = effect["parameters"][name]
     assert amount["value"] == pytest.approx(true, rel=0.03)  # with a corner it is a tenth too small
     assert law == "algebraic" or amount["ci95"][0] <= true <= amount["ci95"][1]
+
+
+@pytest.mark.parametrize("law", ["tanh", "algebraic"])
+def test_a_friction_that_falls_without_a_corner_is_no_constant_one(law: str) -> None:
+    """Most simulators smooth the sign of a Stribeck friction."""
+
+    def rubbing(t: Array, x: Array, normal: Array) -> Array:
+        v = np.gradient(x, 1e-3)
+        rising = np.tanh(v / 4e-4) if law == "tanh" else v / np.hypot(v, 3e-4)
+        return np.asarray((0.1 + 0.3 * np.exp(-((v / 2e-3) ** 2))) * rising)
+
+    (effect,) = diagnose([pressed(seed, 8.0, rubbing) for seed in (1, 2, 3)], PRESSED).as_dict()["effects"]
+    assert effect["id"] == "stribeck_friction"
+    assert effect["parameters"]["speed_m_per_s"]["value"] == pytest.approx(2e-3, rel=0.1)  # other laws rise otherwise
+
+
+def test_a_mass_is_slowed_by_a_friction_that_falls_without_a_corner() -> None:
+    def moving(seed: int) -> dict[str, Array]:
+        t, rng = np.arange(0.0, 12.0, 5e-3), np.random.default_rng([seed, 6])
+        drive = 6.0 * motion(seed, (0.4, 1.1, 2.3))(t)
+
+        def rates(at: float, s: Array) -> list[float]:
+            x, v = s
+            rubs = (0.8 + 0.9 * np.exp(-((v / 0.04) ** 2))) * v / np.hypot(v, 2e-3)
+            return [v, (np.interp(at, t, drive) - 3.0 * v - 60.0 * x - rubs) / 0.9]
+
+        x = solve_ivp(rates, (0.0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-7, atol=1e-10, max_step=2e-3).y[0]
+        return {"t": t, "u": drive, "x": x + 5e-5 * rng.standard_normal(t.size)}
+
+    nominal = {
+        "name": "slide",
+        "kind": "axis",
+        "data": {"time": "t"},
+        "channels": {"drive": {"column": "u", "unit": "N"}, "place": {"column": "x", "unit": "m"}},
+        "axis": {
+            "subsystem": "slide",
+            "input": "drive",
+            "output": "place",
+            "hold": "linear",
+            "reads": "position",
+            "terms": ["mass", "damping", "stiffness", "offset"],
+        },
+    }
+    (effect,) = diagnose([moving(seed) for seed in (1, 2, 3)], nominal).as_dict()["effects"]
+    assert effect["id"] == "stribeck_friction"
