@@ -104,6 +104,8 @@ def next_step(result: Diagnosis) -> str:
     first = next((f for f in result.findings if f.id not in REMARKS and (f.id, f.channel) not in remarks), None)
     if first is not None:
         return f"Correct the data first ({first.id}: {first.channel}), then diagnose again."
+    if any(term.candidate.effect.dated for term in result.found.best.terms):
+        return "Home the axis, find out what happened to it and to its sensor at these instants, and record again."
     unsure = [entry for entry in named if entry["probability"] < result.problem.rules.confident]
     useful = next((design for design in result.designs if design.separates), None)
     if useful is not None:
@@ -121,8 +123,6 @@ def next_step(result: Diagnosis) -> str:
     if unsure:
         shown = words(unsure[0]["id"])
         return f"Record a further motion that shows {shown}, and diagnose again: the verdict is not confident yet."
-    if any(term.candidate.effect.dated for term in result.found.best.terms):
-        return "Home the axis that lost steps, find its load, speed and current at these instants, and record again."
     if named:
         return "Add the effects to the nominal model (the report has the lines), and check it on a new recording."
     undecided = sorted((f for f in result.findings if f.id in UNDECIDED), key=lambda f: UNDECIDED.index(f.id))

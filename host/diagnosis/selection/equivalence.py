@@ -57,6 +57,9 @@ def standings(problem: Problem, found: Found) -> list[Standing]:
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said, *paired))
         if term.candidate.effect.extended and not any(other.effect.searched for other in alike):
             alike += (_as_equation(term.candidate),)
+        if term.candidate.effect.dated:  # what happened at these instants may be no physics of the model at all
+            event = _as_equation(term.candidate)
+            alike, differences = (*alike, event), (*differences, (event, 0.0))
         alone = _rests_on(problem, less, found.best, term.fitted)
         # No inexact formula of another effect leaves a line that no motion has.
         doubtful = less.terms and not term.candidate.effect.memories

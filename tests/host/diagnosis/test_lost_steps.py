@@ -46,7 +46,7 @@ def test_steps_that_recordings_lose_at_instants_of_their_own(losing):
     assert result["verdict"] == "missing_physics"
     (effect,) = result["effects"]
     assert effect["id"] == "missed_steps" and effect["subsystem"] == "gear"
-    assert effect["probability"] > 0.9
+    assert 0.4 < effect["probability"] < 0.9 and effect["indistinguishable_from"] == ["unlisted@gear"]  # or a moved sensor
     for number in losing:
         assert f"at {instants[number]:.4g} s of recording {number + 1}" in effect["says"]
     sizes = [entry["value"] for name, entry in effect["parameters"].items() if name.startswith("jump")]
