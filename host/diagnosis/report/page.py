@@ -81,7 +81,7 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
             footer=f"{recordings} recording{'s' if recordings > 1 else ''}, {samples} samples, {verdict['seconds']:.0f} s.",
             lines=lines(result, verdict),
             pictures=pictures(result),
-            effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
+            effects=[{**shown_effect(e, units_of(result)), "judged_by": judged_by(result, e)} for e in verdict["effects"]],
             nominal=_nominal(result),
             candidates=candidates(result),
             located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
@@ -179,6 +179,15 @@ def times(place: dict[str, Any], most: int = 3, timed: bool = True) -> str:
                 f"{name}: " + ", ".join(f"{a:.{int(timed)}f} to {b:.{int(timed)}f} {unit}" for a, b in longest) + more
             )
     return "; ".join(shown[:most]) + (f"; and {len(shown) - most} more recordings" if len(shown) > most else "")
+
+
+def judged_by(result: Diagnosis, effect: dict[str, Any]) -> str:
+    """What is lower without an effect: the likelihood of the samples that its evidence is of."""
+    named = effect["id"], effect["port"]
+    standing = next(s for s in result.standings if (s.candidate.effect.id, s.candidate.port.name) == named)
+    if standing.candidate.effect.dated:
+        return "log-likelihood of all samples"
+    return "log-likelihood of recordings predicted from the others" if standing.crossed else "held-out log-likelihood"
 
 
 def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> dict[str, Any]:
