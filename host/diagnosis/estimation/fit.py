@@ -13,7 +13,7 @@ from numba import njit
 from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
-from host.diagnosis.model.effect import Candidate, Parameter, cornered
+from host.diagnosis.model.effect import Candidate, Parameter, Port, cornered
 from host.diagnosis.model.model import ActiveEffect, Begin, Model, Segment
 
 Array = npt.NDArray[np.float64]
@@ -164,6 +164,12 @@ class Problem:
         r[:, : self.unseen(segment, terms, values)] = np.nan
         r[:, segment.n - self.ends(segment, terms, values) :] = np.nan
         return np.asarray(r)
+
+    def needs(self, fit: Fit, port: Port) -> list[Array]:
+        """The displacement or force (n,) of each recording that `port` would need to explain what `fit` leaves."""
+        nominal = fit.values[: len(self.model.parameters)]
+        pairs = zip(self.segments, fit.residuals, strict=True)
+        return [self.model.needs(segment, port, nominal, r) for segment, r in pairs]
 
     def residuals(self, terms: tuple[Term, ...], values: Array, which: str = "fit") -> list[Array]:
         """Measured minus simulated, NaN outside the requested part (`fit`, `heldout` or `all`)."""

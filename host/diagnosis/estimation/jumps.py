@@ -13,7 +13,6 @@ from host.diagnosis.model.operators import fill
 
 Array = npt.NDArray[np.float64]
 SIDE = 20  # samples before and after a jump whose medians are compared
-STEEP = 0.6  # of a change between medians that happens within few samples: a ramp has a quarter there
 NEAR = 3  # samples before and after a jump, between which most of it happens
 
 
@@ -39,14 +38,14 @@ def jumps_of(residuals: Sequence[Array], rules: SelectionRules) -> list[Jump]:
     return found
 
 
-def steps_there(signal: Array, sample: int, least: float) -> bool:
+def steps_there(signal: Array, sample: int, least: float, rules: SelectionRules) -> bool:
     """Whether `signal` (n,) itself steps at `sample`, by more than `least` of its span."""
     before, after = signal[max(sample - SIDE, 0) : sample], signal[sample : sample + SIDE]
     if not before.size or not after.size:
         return False
     near = float(np.ptp(signal[max(sample - NEAR, 0) : sample + NEAR]))
     far = abs(float(np.median(after) - np.median(before)))
-    return near > least * float(np.ptp(signal)) and near > STEEP * far
+    return near > least * float(np.ptp(signal)) and near > rules.jump_abrupt_share * far
 
 
 def _jumps(r: Array, number: int, rules: SelectionRules) -> list[Jump]:

@@ -87,16 +87,12 @@ def _in_fit(problem: Problem, jump: Jump) -> bool:
 
 def _jumps(problem: Problem, base: Fit, port: Port) -> list[Jump]:
     """Jumps of what `port` would need; none where an input steps at one of them."""
-    n = len(problem.model.parameters)
-    needs = [
-        problem.model.needs(segment, port, base.values[:n], r)
-        for segment, r in zip(problem.segments, base.residuals, strict=True)
-    ]
+    needs = problem.needs(base, port)
     jumps = [jump for jump in jumps_of(needs, problem.rules) if asked(problem.segments[jump.recording], "both")[jump.sample]]
     for jump in jumps:
         segment = problem.segments[jump.recording]
         inputs = [problem.model.motion(segment, port), *segment.inputs.values()]
-        if any(steps_there(signal, jump.sample, LEAST_STEP) for signal in inputs):
+        if any(steps_there(signal, jump.sample, LEAST_STEP, problem.rules) for signal in inputs):
             return []
     return jumps
 

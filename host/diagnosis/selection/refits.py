@@ -234,11 +234,7 @@ def _memory_and_values(problem: Problem, fit: Fit) -> Fit:
 
 
 def _need_rms(problem: Problem, fit: Fit, candidate: Candidate) -> float:
-    n = len(problem.model.parameters)
-    needs = [
-        problem.model.needs(segment, candidate.port, fit.values[:n], r)
-        for segment, r in zip(problem.segments, fit.residuals, strict=True)
-    ]
+    needs = problem.needs(fit, candidate.port)
     return float(np.sqrt(np.nanmean(np.concatenate(needs) ** 2)))
 
 

@@ -69,11 +69,11 @@ def concluded(problem: Problem, found: Found, candidate_effects: list[Candidate]
     """Pairs, detours, exchanges and removals after `forward`: the second part of `search`."""
     _join(problem, found, candidate_effects, progress)
     found = _detour(problem, found, candidate_effects, progress)
-    _finish(problem, found, candidate_effects, progress)
+    _revise(problem, found, candidate_effects, progress)
     return _past_lost_steps(problem, found, candidate_effects, progress)
 
 
-def _finish(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> None:
+def _revise(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> None:
     """Exchanges, simpler shapes and removals, once no further effect earns its place."""
     _exchange(problem, found, candidate_effects, progress)
     if len(found.best.terms) > 1:
@@ -110,7 +110,7 @@ def _past_lost_steps(problem: Problem, found: Found, candidate_effects: list[Can
     other = Found(found.nominal, _taken(problem, lost.trial), [first], lost.forms)
     earned = problem.gain("both", found.nominal.residuals, other.best.residuals).log_likelihood
     _grow(problem, other, candidate_effects, earned, progress)
-    _finish(problem, other, candidate_effects, progress)
+    _revise(problem, other, candidate_effects, progress)
     if any(term.candidate.effect.dated for term in other.best.terms) and (
         not found.best.terms or _ahead(problem, other, found)
     ):

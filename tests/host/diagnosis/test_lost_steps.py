@@ -6,15 +6,10 @@ import pytest
 from host.diagnosis import diagnose
 from host.diagnosis.export.module import module_of
 from protocol.errors import InputError
+from tests.host.proof.everyday import gear_nominal
 
 PERIOD_S, SAMPLES, LOST_RAD = 0.01, 3000, 0.08
-NOMINAL = {
-    "name": "gear",
-    "kind": "transmission",
-    "data": {"time": "time_s"},
-    "channels": {"motor": {"column": "motor", "unit": "rad"}, "load": {"column": "load", "unit": "rad"}},
-    "link": [{"subsystem": "gear", "input": "motor", "output": "load"}],
-}
+NOMINAL = gear_nominal()
 
 
 def recordings(losing, law=lambda turned: turned, seed=5, motion=None):
@@ -26,7 +21,7 @@ def recordings(losing, law=lambda turned: turned, seed=5, motion=None):
         turned = turned if motion is None else motion(rng)
         instants.append(time_s[rng.integers(SAMPLES // 4, 3 * SAMPLES // 4)])
         arrived = law(turned - LOST_RAD * (time_s >= instants[-1]) if number in losing else turned)
-        sets.append({"time_s": time_s, "motor": turned, "load": 0.6 * arrived + 0.02 + 0.002 * rng.standard_normal(SAMPLES)})
+        sets.append({"t": time_s, "motor": turned, "load": 0.6 * arrived + 0.02 + 0.002 * rng.standard_normal(SAMPLES)})
     return sets, instants
 
 

@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from host.diagnosis import diagnose
+from tests.host.proof.everyday import axis_nominal
 
 pytestmark = pytest.mark.slow
 Array = np.ndarray
@@ -310,21 +311,7 @@ def test_a_mass_is_slowed_by_a_friction_that_falls_without_a_corner() -> None:
             return [v, (np.interp(at, t, drive) - 3.0 * v - 60.0 * x - rubs) / 0.9]
 
         x = solve_ivp(rates, (0.0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-7, atol=1e-10, max_step=2e-3).y[0]
-        return {"t": t, "u": drive, "x": x + 5e-5 * rng.standard_normal(t.size)}
+        return {"t": t, "f": drive, "x": x + 5e-5 * rng.standard_normal(t.size)}
 
-    nominal = {
-        "name": "slide",
-        "kind": "axis",
-        "data": {"time": "t"},
-        "channels": {"drive": {"column": "u", "unit": "N"}, "place": {"column": "x", "unit": "m"}},
-        "axis": {
-            "subsystem": "slide",
-            "input": "drive",
-            "output": "place",
-            "hold": "linear",
-            "reads": "position",
-            "terms": ["mass", "damping", "stiffness", "offset"],
-        },
-    }
-    (effect,) = diagnose([moving(seed) for seed in (1, 2, 3)], nominal).as_dict()["effects"]
+    (effect,) = diagnose([moving(seed) for seed in (1, 2, 3)], axis_nominal()).as_dict()["effects"]
     assert effect["id"] == "stribeck_friction"
