@@ -42,7 +42,7 @@ def seeds(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> t
     Recordings without a common clock are laid upon each other from their begin: an axis that is homed before each of
     them forgets what it lost, and the same motion loses it again at the same instants.
     """
-    count = COUNT[form]
+    count = COUNT.get(form, 1)
     if count == 1 and not evidence.one_clock:
         return parameters
     time_s, need = np.concatenate(evidence.time_s), np.concatenate(evidence.need)
@@ -75,7 +75,7 @@ def change_points(values: Array, count: int) -> list[int]:
         for k in range(count):
             low = places[k - 1] if k > 0 else 0
             high = places[k + 1] if k + 1 < count else values.size
-            places[k] = low + _split(values[low:high])
+            places[k] = low + two_levels(values[None, low:high])
     return places
 
 
@@ -105,15 +105,14 @@ def _segmented(means: Array, weights: Array, count: int) -> list[int]:
     return places[:0:-1]
 
 
-def _split(values: Array) -> int:
-    """Sample at which two constants fit `values` (n,) best."""
-    n = values.size
+def two_levels(values: Array) -> int:
+    """Sample at which two constants for each row of `values` (rows, n) fit best."""
+    n = values.shape[1]
     if n < 3:
         return max(n // 2, 1)
-    first = np.arange(1, n)
-    total = np.cumsum(values)
-    gain = total[:-1] ** 2 / first + (total[-1] - total[:-1]) ** 2 / (n - first)
-    return int(np.argmax(gain)) + 1
+    first, total = np.arange(1, n), np.cumsum(values, axis=1)
+    gain = total[:, :-1] ** 2 / first + (total[:, -1:] - total[:, :-1]) ** 2 / (n - first)
+    return int(np.argmax(np.sum(gain, axis=0))) + 1
 
 
 @dataclass(frozen=True)

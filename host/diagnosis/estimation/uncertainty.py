@@ -12,6 +12,7 @@ from scipy import stats
 
 from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, answers_to_begin, free, jacobian, size_of
+from host.diagnosis.estimation.instants import instant_interval
 from host.diagnosis.model.effect import Parameter
 from host.diagnosis.model.findings import Finding
 
@@ -57,9 +58,10 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     out = [(float(v), float(v)) for v in fit.values]
     for place, index in enumerate(free(parameters)):
         p, value, half = parameters[index], float(fit.values[index]), float(widths[place])
-        if p.event:  # between two samples nothing shows it
-            half = max(half, 0.5 * problem.segments[0].recording.dt_s / sizes[index])
-        if p.unit == "s" and not (p.event or p.linear) and index >= len(problem.model.parameters):
+        if p.event:
+            out[index] = instant_interval(problem, fit, index, level)
+            continue
+        if p.unit == "s" and not p.linear and index >= len(problem.model.parameters):
             apart_s = problem.rules.sampling_delay * problem.recorded_s / np.sqrt(3.0)
             half = float(np.hypot(half, quantile * apart_s / (value if p.log else sizes[index])))
         if p.log:

@@ -83,7 +83,8 @@ def probabilities(suspects: list[Suspect], samples: int, inflation: float) -> li
 
 def _causes(twin: Twin) -> list[Candidate]:
     """The vocabulary at every port but the wall; a distorted field in the form that seconds of motion can show."""
-    listed = candidates(twin.ports, True, twin.taken | {LOCAL_FIELD.id})
+    # A bias that began with the alarm is constant all through it: its instant is not one more unknown.
+    listed = candidates(twin.ports, True, twin.taken | {LOCAL_FIELD.id, "sensor_bias:jump"})
     local = [Candidate(LOCAL_FIELD, port) for port in twin.ports if LOCAL_FIELD.port in port.kind.split("+")]
     return [c for c in (*listed, *local) if c.port.name != "contact"]
 

@@ -210,12 +210,12 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
     if not trials or problem.budget.spent():
         return trials
     least, fitted = trials[0].both.log_likelihood, {trial.candidate.key for trial in trials}
-    richer = [t.candidate for t in trials if t is trials[0] or (t.both.log_likelihood >= least and good_enough(t, best))]
+    richer = [t for t in trials if t is trials[0] or (t.both.log_likelihood >= least and good_enough(t, best))]
     missing = [
         item
         for item in ranked
         if item.candidate.key not in fitted
-        and any(contained(item.candidate, c) for c in richer)
+        and any(contained(item.candidate, t.candidate) or _fewer_events(item.term, t.fit.terms[-1]) for t in richer)
         and item.promise > problem.rules.screening_log_likelihood
     ]
     if not missing:
@@ -223,6 +223,13 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
     more = [*trials, *(try_fit(problem, best, item) for item in missing[: problem.rules.simpler_fits])]
     rank(problem, more, best)
     return more
+
+
+def _fewer_events(one: Term, other: Term) -> bool:
+    """Whether both are one effect at one place that happens at instants, and `one` at fewer of them."""
+    a, b = one.candidate, other.candidate
+    few = [sum(p.event for p in term.parameters) for term in (one, other)]
+    return (a.effect.id, a.port.name) == (b.effect.id, b.port.name) and 0 < few[0] < few[1]
 
 
 def with_wider(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened]) -> list[Trial]:
