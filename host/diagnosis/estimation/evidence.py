@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -17,21 +19,42 @@ Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Gain:
-    """Gain in log-likelihood, one-sided p-value that there is none, and the share of the error that went, in the output
-    that gained most.
+class PairedBlocks:
+    """What independent blocks of samples gained, one array for each output; tested where a decision asks for it."""
 
-    `excess`: share of that output's error before that is above noise; `excesses` (outputs,): the same afterwards.
+    by_output: Sequence[Array]
+    rules: SelectionRules
+
+    @cached_property
+    def p_value(self) -> float:
+        """The smaller of: all outputs together, and the surest output times their number (Bonferroni)."""
+        if not self.by_output:
+            return 1.0
+        together = _sign_of_mean(np.concatenate(self.by_output), self.rules)
+        alone = min(_sign_of_mean(blocks, self.rules) for blocks in self.by_output)
+        return float(min(1.0, together, alone * len(self.by_output))) if len(self.by_output) > 1 else together
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Gain in log-likelihood, and the share of the error that went, in the output that gained most.
+
+    `paired`: blocks that tell whether there is one, or the p-value that there is none. `excess`: share of that output's error before that is above noise; `excesses` (outputs,): the same afterwards.
     `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
     """
 
     log_likelihood: float
-    p_value: float
+    paired: PairedBlocks | float
     share: float
     excess: float = 1.0
     independent: Array = field(default_factory=lambda: np.zeros(0))
     log_ratio: Array = field(default_factory=lambda: np.zeros(0))
     excesses: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def p_value(self) -> float:
+        """One-sided p-value that there is no gain."""
+        return self.paired if isinstance(self.paired, float) else self.paired.p_value
 
 
 def correlation_time(r: Array, longest: int | None = None) -> float:
@@ -74,7 +97,7 @@ def compare(
     raw_before, raw_after = before, after
     before, after = _freed(segments, before), _freed(segments, after)
     independent, log_ratio, excess, excess_after = (np.zeros(noise_sd.size) for _ in range(4))
-    by_output: list[list[float]] = []
+    by_output: list[Array] = []
     for row in range(noise_sd.size):
         b2, a2, n_eff, times = _pooled(segments, which, before, after, row)
         if n_eff < rules.evidence_independent_samples:
@@ -85,14 +108,14 @@ def compare(
         independent[row], log_ratio[row] = n_eff, np.log(level_b / level_a)
         excess[row] = max(0.0, 1.0 - noise_sd[row] ** 2 / level_b)
         excess_after[row] = max(0.0, 1.0 - rules.excess_noise_ratio * noise_sd[row] ** 2 / level_a)
-        by_output.append(_blocks(segments, which, before, after, row, times, level_a))
+        by_output.append(np.array(_blocks(segments, which, before, after, row, times, level_a)))
     gain = 0.5 * float(independent @ log_ratio)
     top = int(np.argmax(independent * log_ratio))
     share = float(1.0 - np.exp(-log_ratio[top]))
     if before is not raw_before:
         b2, a2, _, _ = _pooled(segments, which, raw_before, raw_after, top)
         share, excess[top] = 1.0 - a2 / max(b2, 1e-300), max(0.0, 1.0 - noise_sd[top] ** 2 / max(b2, 1e-300))
-    return Gain(gain, _p_value(by_output, rules), share, float(excess[top]), independent, log_ratio, excess_after)
+    return Gain(gain, PairedBlocks(by_output, rules), share, float(excess[top]), independent, log_ratio, excess_after)
 
 
 def _freed(segments: list[Segment], residuals: list[Array]) -> list[Array]:
@@ -103,15 +126,6 @@ def _freed(segments: list[Segment], residuals: list[Array]) -> list[Array]:
         np.vstack([freed(segment, row, values) for row, values in enumerate(r)])
         for segment, r in zip(segments, residuals, strict=True)
     ]
-
-
-def _p_value(by_output: list[list[float]], rules: SelectionRules) -> float:
-    """The smaller of: all outputs together, and the surest output times their number (Bonferroni)."""
-    if not by_output:
-        return 1.0
-    together = _sign_of_mean(np.concatenate([np.array(blocks) for blocks in by_output]), rules)
-    alone = min(_sign_of_mean(np.array(blocks), rules) for blocks in by_output)
-    return float(min(1.0, together, alone * len(by_output))) if len(by_output) > 1 else together
 
 
 def asked(segment: Segment, which: str) -> Mask:
