@@ -39,8 +39,9 @@ class PairedBlocks:
 class Gain:
     """Gain in log-likelihood, and the share of the error that went, in the output that gained most.
 
-    `paired`: blocks that tell whether there is one, or the p-value that there is none. `excess`: share of that output's error before that is above noise; `excesses` (outputs,): the same afterwards.
-    `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
+    `paired`: blocks that tell whether there is a gain, or the p-value that there is none. `excess`: share of that output's
+    error before that is above noise; `excesses` (outputs,): the same afterwards. `independent` and `log_ratio` (outputs,):
+    effective sample sizes, and logarithms of the ratio of mean squares.
     """
 
     log_likelihood: float
