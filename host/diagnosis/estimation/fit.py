@@ -36,8 +36,11 @@ class Term:
 
     @property
     def fitted(self) -> int:
-        """Return how many of its parameters are fitted: a middle or a range that the recordings give costs no evidence."""
-        return len(free(list(self.parameters)))
+        """Return how many of its parameters are fitted: a middle or a range that the recordings give costs no evidence.
+
+        An instant counts twice: it is chosen among all samples (modified BIC, Zhang and Siegmund 2007).
+        """
+        return sum(2 if self.parameters[index].event else 1 for index in free(list(self.parameters)))
 
 
 @dataclass

@@ -17,7 +17,7 @@ from host.diagnosis.selection.posterior import Posterior, ahead_of_rival, coarse
 from host.diagnosis.selection.refits import fit_without, refined
 from host.diagnosis.selection.removal import unsure
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.trial import Trial, at_bound, related
+from host.diagnosis.selection.trial import Trial, at_bound, reached, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at
 
@@ -257,18 +257,25 @@ def _equals(
 ) -> tuple[tuple[Candidate, ...], list[tuple[Candidate, float]]]:
     """Rivals in the place of `candidate`: those that neither held-out samples nor all together separate from it, and all
     that were refitted with their coarsened differences.
+
+    A form that ended as the named effect says nothing of another one: the next form of its name is refitted then.
     """
     best = found.best
     kept: list[Candidate] = []
     refitted: list[tuple[Candidate, float]] = []
-    for trial in _rivals(found, candidate, problem.rules)[: problem.rules.equals_fits]:
+    rivals = _rivals(found, candidate, problem.rules)
+    names = [*dict.fromkeys(trial.candidate.name for trial in rivals)][: problem.rules.equals_fits]
+    for trial in rivals:
         if problem.budget.spent():
             break
+        if trial.candidate.name not in names:
+            continue
         if replaced_by(less, trial.candidate) != ():
             continue  # it stands for another active effect too: both together would say one thing twice
         if _elsewhere(trial.candidate, candidate):
             refitted.append((trial.candidate, 0.0))
             kept.append(trial.candidate)
+            names.remove(trial.candidate.name)
             continue
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
@@ -281,7 +288,13 @@ def _equals(
         if contained and (at_bound(other) or _collapsed(problem, best, other)):
             continue
         if at_bound(other) and other.fitted > best.fitted:
-            continue  # its further parameter ended at a bound, so it says what the simpler one says
+            if trial.candidate.name == candidate.name or contained:
+                continue
+            inside = _inside(problem, other)  # at the bound it may say what the simpler one says
+            if inside is None:
+                continue
+            other = inside
+        names.remove(trial.candidate.name)
         ahead = problem.gain("both", other.residuals, best.residuals)
         held = problem.gain("heldout", other.residuals, best.residuals)
         rival = problem.gain("both", less.residuals, other.residuals)
@@ -292,6 +305,25 @@ def _equals(
         if len(kept) < problem.rules.most_equals and _indistinguishable(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)
     return tuple(kept), refitted
+
+
+def _inside(problem: Problem, fit: Fit) -> Fit | None:
+    """`fit` with the shapes of its last term that ended at a bound held in the middle of the values that are tried first;
+    None where an amplitude ended at one.
+
+    If that is no less likely than the named effect, the data leave the shape open, and with it the name.
+    """
+    term, values = fit.terms[-1], fit.values.copy()
+    first, parameters = fit.first_of(term), list(term.parameters)
+    for k, p in enumerate(parameters):
+        if not reached(p, float(values[first + k]), term.candidate.effect.natural_bounds):
+            continue
+        if p.linear:
+            return None
+        values[first + k] = middle = sorted(p.grid)[len(p.grid) // 2]
+        parameters[k] = replace(p, low=middle, high=middle)
+    terms = (*fit.terms[:-1], replace(term, parameters=tuple(parameters)))
+    return finish(problem, minimize(problem, terms, values, rounds=problem.rules.further_iterations, tolerance=1e-4))
 
 
 def _elsewhere(rival: Candidate, candidate: Candidate) -> bool:
@@ -325,7 +357,7 @@ def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[T
                 and trial.candidate.name not in others
                 and (simpler or trial.score > rules.equals_score * most)
             ):
-                kept.setdefault(trial.candidate.name, trial)
+                kept.setdefault(trial.candidate.key, trial)
     return sorted(kept.values(), key=lambda trial: -trial.score)
 
 

@@ -54,7 +54,10 @@ def _at(problem: Problem, base: Fit, port: Port) -> LostSteps | None:
     small = iter(sizes < LEAST_SIZE * np.max(sizes, initial=0.0))
     kept = [jump for jump in jumps if not (_in_fit(problem, jump) and next(small))]
     found = _fitted(problem, base, port, kept) if len(kept) < len(jumps) else found
-    rules, price = problem.rules, 2.0 * problem.rules.parameter_penalty * len(kept)  # of a size and an instant each
+    rules, price = (
+        problem.rules,
+        3.0 * problem.rules.parameter_penalty * len(kept),
+    )  # a size, and an instant that counts twice
     both = found.trial.both
     sure = both.log_likelihood > rules.decisive_log_likelihood + price and not refuted(found.trial.heldout, rules)
     return found if sure and both.share > rules.large_error_reduction else None

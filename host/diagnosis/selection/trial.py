@@ -47,10 +47,10 @@ def bound_by(fit: Fit, term: Term) -> bool:
     if _drives(term, values):
         return True
     natural = term.candidate.effect.natural_bounds
-    return any(_reached(p, float(value), natural) for p, value in zip(term.parameters, values, strict=True))
+    return any(reached(p, float(value), natural) for p, value in zip(term.parameters, values, strict=True))
 
 
-def _reached(p: Parameter, value: float, natural: bool) -> bool:
+def reached(p: Parameter, value: float, natural: bool) -> bool:
     """Whether `value` is at a bound of `p` that is not a natural one. natural: whether the effect's bounds are."""
     if p.high <= p.low:
         return False

@@ -300,6 +300,18 @@ def test_a_friction_that_falls_without_a_corner_is_no_constant_one(law: str) -> 
     assert effect["parameters"]["speed_m_per_s"]["value"] == pytest.approx(2e-3, rel=0.1)  # other laws rise otherwise
 
 
+def test_a_fall_of_friction_that_the_recordings_hardly_show_stays_open() -> None:
+    """Friction that falls by a third, rounded by another law: a constant one does as well, and says so."""
+
+    def rubbing(t: Array, x: Array, normal: Array) -> Array:
+        v = np.gradient(x, 1e-3)
+        return np.asarray((0.1 + 0.05 * np.exp(-((v / 2e-3) ** 2))) * v / np.hypot(v, 3e-4))
+
+    (effect,) = diagnose([pressed(seed, 8.0, rubbing) for seed in (1, 2, 3)], PRESSED).as_dict()["effects"]
+    assert effect["id"] == "coulomb_friction" and effect["probability"] < 0.9
+    assert effect["indistinguishable_from"] == ["stribeck_friction@pad"]
+
+
 def test_a_mass_is_slowed_by_a_friction_that_falls_without_a_corner() -> None:
     def moving(seed: int) -> dict[str, Array]:
         t, rng = np.arange(0.0, 12.0, 5e-3), np.random.default_rng([seed, 6])
