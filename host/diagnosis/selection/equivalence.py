@@ -290,10 +290,9 @@ def _equals(
         if at_bound(other) and other.fitted > best.fitted:
             if trial.candidate.name == candidate.name or contained:
                 continue
-            inside = _inside(problem, other)  # at the bound it may say what the simpler one says
-            if inside is None:
+            other = _inside(problem, other)  # at the bound it may say what the simpler one says
+            if problem.gain("both", other.residuals, best.residuals).log_likelihood > problem.rules.equal_log_likelihood:
                 continue
-            other = inside
         names.remove(trial.candidate.name)
         ahead = problem.gain("both", other.residuals, best.residuals)
         held = problem.gain("heldout", other.residuals, best.residuals)
@@ -307,23 +306,26 @@ def _equals(
     return tuple(kept), refitted
 
 
-def _inside(problem: Problem, fit: Fit) -> Fit | None:
-    """`fit` with the shapes of its last term that ended at a bound held in the middle of the values that are tried first;
-    None where an amplitude ended at one.
+def _inside(problem: Problem, fit: Fit) -> Fit:
+    """`fit` with each shape of its last term that ended at a bound held at the best of the values that are tried first.
 
     If that is no less likely than the named effect, the data leave the shape open, and with it the name.
     """
-    term, values = fit.terms[-1], fit.values.copy()
-    first, parameters = fit.first_of(term), list(term.parameters)
-    for k, p in enumerate(parameters):
-        if not reached(p, float(values[first + k]), term.candidate.effect.natural_bounds):
+    for k, p in enumerate(fit.terms[-1].parameters):
+        term = fit.terms[-1]
+        place = fit.first_of(term) + k
+        if p.linear or not reached(p, float(fit.values[place]), term.candidate.effect.natural_bounds):
             continue
-        if p.linear:
-            return None
-        values[first + k] = middle = sorted(p.grid)[len(p.grid) // 2]
-        parameters[k] = replace(p, low=middle, high=middle)
-    terms = (*fit.terms[:-1], replace(term, parameters=tuple(parameters)))
-    return finish(problem, minimize(problem, terms, values, rounds=problem.rules.further_iterations, tolerance=1e-4))
+        held = []
+        for value in p.grid:
+            begin = fit.values.copy()
+            begin[place] = value
+            parameters = (*term.parameters[:k], replace(p, low=value, high=value), *term.parameters[k + 1 :])
+            terms = (*fit.terms[:-1], replace(term, parameters=parameters))
+            other = minimize(problem, terms, begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
+            held.append(finish(problem, other))
+        fit = max(held, key=lambda other: problem.gain("both", fit.residuals, other.residuals).log_likelihood)
+    return fit
 
 
 def _elsewhere(rival: Candidate, candidate: Candidate) -> bool:
