@@ -265,8 +265,9 @@ def _equals(
     refitted: list[tuple[Candidate, float]] = []
     rivals = _rivals(found, candidate, problem.rules)
     names = [*dict.fromkeys(trial.candidate.name for trial in rivals)][: problem.rules.equals_fits]
+    refits = 0
     for trial in rivals:
-        if problem.budget.spent():
+        if problem.budget.spent() or refits == problem.rules.equals_fits:
             break
         if trial.candidate.name not in names:
             continue
@@ -280,7 +281,7 @@ def _equals(
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
         begin = np.concatenate((less.values, start))
-        begun = get_starts(problem)
+        begun, refits = get_starts(problem), refits + 1
         other = minimize(problem, (*less.terms, term), begin, rounds=10, tolerance=1e-4)
         other = finish(problem, begun_again(problem, other))
         set_starts(problem, begun)
@@ -288,7 +289,8 @@ def _equals(
         if contained and (at_bound(other) or _collapsed(problem, best, other)):
             continue
         if at_bound(other) and other.fitted > best.fitted:
-            if trial.candidate.name == candidate.name or contained:
+            family = candidate.effect.family
+            if trial.candidate.name == candidate.name or contained or not family or trial.candidate.effect.family != family:
                 continue
             other = _inside(problem, other)  # at the bound it may say what the simpler one says
             if problem.gain("both", other.residuals, best.residuals).log_likelihood > problem.rules.equal_log_likelihood:
