@@ -89,7 +89,7 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
     elif form == "shift":
         when = 1.0 - np.exp(-np.maximum(t - p[6], 0.0) / p[7])
     else:
-        when = np.clip((t - p[6]) / c.dt_s + 0.5, 0.0, 1.0)
+        when = c.after(p[6])
     place = np.array([p[0], p[1], 0.0]) if form == "constant" else p[:3]
     turn = np.array([p[2], p[3], 0.0]) if form == "constant" else p[3:6]
     return {**state, "shift": state["shift"] + np.outer(place, when), "turn": turned(np.outer(turn, when))}

@@ -32,7 +32,7 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Steps at the instants, each one sample wide."""
     out = signal
     for jump, instant in zip(p[::2], p[1::2], strict=True):
-        out = out + jump * np.clip((c.time_s - instant) / c.dt_s + 0.5, 0.0, 1.0)
+        out = out + jump * c.after(instant)
     return np.asarray(out)
 
 
@@ -42,7 +42,7 @@ def seeds(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> t
     Recordings without a common clock are laid upon each other from their begin: an axis that is homed before each of
     them forgets what it lost, and the same motion loses it again at the same instants.
     """
-    count = COUNT.get(form, 1)
+    count = sum(p.event for p in parameters)
     if count == 1 and not evidence.one_clock:
         return parameters
     time_s, need = np.concatenate(evidence.time_s), np.concatenate(evidence.need)
@@ -56,10 +56,14 @@ def seeds(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> t
         if p.linear:
             found.append(p)
             continue
-        at = change_points(need, count)[k // 2]
-        instant = 0.5 * (time_s[at - 1] + time_s[at])
-        found.append(replace(p, grid=(float(min(max(instant, p.low), p.high)),)))
+        found.append(begun_at(p, time_s, change_points(need, count)[k // 2]))
     return tuple(found)
+
+
+def begun_at(instant: Parameter, time_s: Array, sample: int) -> Parameter:
+    """The parameter `instant` that is first tried between `sample` and the one before it."""
+    middle = 0.5 * (time_s[sample - 1] + time_s[sample])
+    return replace(instant, grid=(float(min(max(middle, instant.low), instant.high)),))
 
 
 def change_points(values: Array, count: int) -> list[int]:

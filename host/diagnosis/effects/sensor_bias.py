@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from host.diagnosis.effects.missed_steps import seeds, two_levels
+from host.diagnosis.effects.missed_steps import begun_at, seeds, two_levels
 from host.diagnosis.model.effect import Array, Context, Effect, Evidence, Parameter, Scale, in_form
 
 
@@ -50,20 +50,13 @@ def force_seeds(evidence: Evidence, parameters: tuple[Parameter, ...], form: str
     time_s = np.concatenate(evidence.time_s)
     levels = np.array([np.concatenate([own[k].residual / own[k].scale for own in rows]) for k in range(len(rows[0]))])
     order = np.argsort(time_s, kind="stable")
-    time_s, levels = time_s[order], levels[:, order]
-    at = two_levels(levels)
     *offsets, when = parameters
-    return (*offsets, replace(when, grid=(float(np.clip(0.5 * (time_s[at - 1] + time_s[at]), when.low, when.high)),)))
-
-
-def after(c: Context, at: float) -> Array:
-    """Return 0 before the instant `at` (s) and 1 after it (n,), one sample wide."""
-    return np.asarray(np.clip((c.time_s - at) / c.dt_s + 0.5, 0.0, 1.0))
+    return (*offsets, begun_at(when, time_s[order], two_levels(levels[:, order])))
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Shift the reading (n,) by p[0]; for the form `jump` after the instant p[1]."""
-    return np.asarray(signal + (p[0] * after(c, p[1]) if form == "jump" else p[0]))
+    return np.asarray(signal + (p[0] * c.after(p[1]) if form == "jump" else p[0]))
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
@@ -74,7 +67,7 @@ def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Shift the force (3, n) by p[:3]; for the form `jump` after the instant p[3]."""
-    return np.asarray(signal + (np.outer(p[:3], after(c, p[3])) if form == "jump" else p[:, None]))
+    return np.asarray(signal + (np.outer(p[:3], c.after(p[3])) if form == "jump" else p[:, None]))
 
 
 _TRACKER = Effect(

@@ -87,6 +87,10 @@ class Context:
         """Direction of the last movement of `signal`."""
         return direction(signal, self.tolerance)
 
+    def after(self, instant: float) -> Array:
+        """Return 0 before `instant` (s) and 1 after it (n,); the step is one sample wide."""
+        return np.asarray(np.clip((self.time_s - instant) / self.dt_s + 0.5, 0.0, 1.0))
+
     def rate(self, signal: Array) -> Array:
         """Rate of `signal` per second by central differences."""
         return np.gradient(signal, self.dt_s)

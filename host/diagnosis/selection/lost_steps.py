@@ -54,11 +54,8 @@ def _at(problem: Problem, base: Fit, port: Port) -> LostSteps | None:
     small = iter(sizes < LEAST_SIZE * np.max(sizes, initial=0.0))
     kept = [jump for jump in jumps if not (_in_fit(problem, jump) and next(small))]
     found = _fitted(problem, base, port, kept) if len(kept) < len(jumps) else found
-    rules, price = (
-        problem.rules,
-        3.0 * problem.rules.parameter_penalty * len(kept),
-    )  # a size, and an instant that counts twice
-    both = found.trial.both
+    rules, both = problem.rules, found.trial.both
+    price = 3.0 * rules.parameter_penalty * len(kept)  # a size, and an instant that counts twice
     sure = both.log_likelihood > rules.decisive_log_likelihood + price and not refuted(found.trial.heldout, rules)
     return found if sure and both.share > rules.large_error_reduction else None
 

@@ -10,6 +10,7 @@ import pytest
 
 import seldinger as sd
 from tests.host.diagnosis import rig_cases
+from tests.host.proof.everyday import axis_nominal, spring_nominal
 
 GEAR: dict[str, Any] = {
     "name": "gear",
@@ -37,24 +38,9 @@ def test_a_lost_step_has_its_instant_within_a_sample(lost: dict[float, float]) -
     assert sizes == pytest.approx([-4.0 * size for size in lost.values()], rel=0.02)
 
 
-STAGE: dict[str, Any] = {
-    "name": "stage",
-    "kind": "axis",
-    "data": {"time": "t"},
-    "channels": {"f": {"column": "f", "unit": "N"}, "x": {"column": "x", "unit": "m"}},
-    "axis": {"subsystem": "stage", "input": "f", "output": "x", "terms": ["mass", "damping", "stiffness", "offset"]},
-}
-PAD: dict[str, Any] = {
-    "name": "pad",
-    "kind": "impedance",
-    "data": {"time": "t"},
-    "channels": {"f": {"column": "f", "unit": "N"}, "x": {"column": "x", "unit": "m"}},
-    "impedance": {"subsystem": "pad", "input": "x", "output": "f", "terms": ["stiffness", "damping", "offset"]},
-}
-
-
 @pytest.mark.parametrize(
-    "nominal, reading, jump, unit", [(STAGE, "x", 1e-3, "m"), (PAD, "f", 0.05, "N"), (PAD, "f", -0.05, "N")]
+    "nominal, reading, jump, unit",
+    [(axis_nominal(), "x", 1e-3, "m"), (spring_nominal(), "f", 0.05, "N"), (spring_nominal(), "f", -0.05, "N")],
 )
 def test_a_reading_that_jumps_is_a_bias_from_one_instant_on(
     nominal: dict[str, Any], reading: str, jump: float, unit: str
@@ -65,7 +51,7 @@ def test_a_reading_that_jumps_is_a_bias_from_one_instant_on(
         sum(c * (2 * np.pi * f) ** n * np.sin(2 * np.pi * f * t + phase + 0.5 * np.pi * n) for f, c, phase in parts)
         for n in range(3)
     )
-    table = {"t": t, "x": x, "f": 50.0 * x + 3.0 * v + (0.5 * a if nominal is STAGE else 0.0)}
+    table = {"t": t, "x": x, "f": 50.0 * x + 3.0 * v + (0.5 * a if "axis" in nominal else 0.0)}
     at = rng.uniform(5.0, 15.0)
     table[reading] = table[reading] + jump * (t > at)
     noisy = {"t": t, "x": table["x"] + 2e-6 * rng.normal(size=t.size), "f": table["f"] + 2e-3 * rng.normal(size=t.size)}
