@@ -149,9 +149,9 @@ def own_losses(losses: tuple[Loss, ...]) -> Effect:
         return tuple(Parameter(f"jump_{k}", s.unit, (loss.size,), linear=True) for k, loss in enumerate(fitted, 1))
 
     def moved(signal: Array, c: Context, p: Array, form: str) -> Array:
-        nothing = np.zeros(1)
         for size, loss in zip([*p, *np.ones(len(heldout))], [*fitted, *heldout], strict=True):
-            signal = signal + size * c.equations.get(loss.key, nothing)
+            if loss.key in c.equations:  # of this recording
+                signal = signal + size * c.laid_out(loss.key)
         return np.asarray(signal)
 
     places = [f"{{jump_{k}}} at {_instant(loss)}" for k, loss in enumerate(fitted, 1)]

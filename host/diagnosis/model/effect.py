@@ -78,7 +78,7 @@ class Context:
     tolerance: float
     start: float = 0.0  # displacement needed at the first sample: start of memory
     source: Array | None = None
-    equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
+    equations: dict[str, Array] = field(default_factory=dict)  # values of forms found by search, one in each sample
     start_rate: float = 0.0  # speed at the first sample beyond that of the motion: start of memory of second order
     starts: tuple[float, ...] = ()  # of an effect with `memories`: each of them, in this recording
     points: int = 1  # of the signal in one sample, where it is held between samples
@@ -90,6 +90,11 @@ class Context:
     def after(self, instant: float) -> Array:
         """Return 0 before `instant` (s) and 1 after it (n,); the step is one sample wide."""
         return np.asarray(np.clip((self.time_s - instant) / self.dt_s + 0.5, 0.0, 1.0))
+
+    def laid_out(self, key: str) -> Array:
+        """Values of the form `key` of `equations`, at each point of the signal."""
+        values = self.equations[key]
+        return values if self.points == 1 else np.repeat(values, self.points)
 
     def rate(self, signal: Array) -> Array:
         """Rate of `signal` per second by central differences."""

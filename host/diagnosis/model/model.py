@@ -249,7 +249,7 @@ def apply_effects(
             tolerance,
             segment.start.get(port, 0.0),
             source,
-            segment.equations if finer == 1 else {k: np.repeat(v, finer) for k, v in segment.equations.items()},
+            segment.equations,
             segment.start.get(rate_key(port), 0.0),
             tuple(segment.start.get(key, 0.0) for key in memory_keys(candidate)),
             finer,

@@ -110,8 +110,9 @@ class SimulatorRun:
         if self.inside is not None:
             segment, active = self.inside
             digest.update(repr(([(c.key, tuple(values)) for c, values in active], segment.start)).encode())
-            for _, values in sorted(segment.equations.items()):
-                digest.update(values.tobytes())
+            if any(c.effect.searched for c, _ in active):  # no other effect reads what is laid out
+                for _, values in sorted(segment.equations.items()):
+                    digest.update(values.tobytes())
         for signal in (self.time_s, *self.inputs.values()):
             digest.update(np.ascontiguousarray(signal).tobytes())
         return digest.digest()

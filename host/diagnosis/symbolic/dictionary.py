@@ -186,7 +186,7 @@ def equation_at(port: Port, form: Form, size: float = 1.0) -> Candidate:
         return (Parameter("amplitude", "", (size,), -np.inf, np.inf, linear=True, step=abs(size) or 1.0),)
 
     def apply(signal: Array, c: Context, p: Array, which: str) -> Array:
-        return np.asarray(signal + p[0] * c.equations[form.text])
+        return np.asarray(signal + p[0] * c.laid_out(form.text))
 
     says = "None of the known effects: the mismatch follows an equation found by search."
     if form.curve:
