@@ -39,7 +39,8 @@ def best_pair(problem: Problem, nominal: Fit, trials: list[Trial], fit_next: Fit
     """
     rules = problem.rules
     singles = _singles(trials, rules.joint_singles)
-    called_for = bool(singles) and singles[0].both.log_likelihood >= rules.heldout_log_likelihood
+    earned = [t.both.log_likelihood - rules.parameter_penalty * (t.fit.fitted - nominal.fitted) for t in singles]
+    called_for = max(earned, default=0.0) > rules.weak_log_likelihood
     if not called_for and not above_noise(problem, nominal, rules.joint_over_noise):
         return None  # nothing calls for an effect, so nothing calls for two
     pairs = [
