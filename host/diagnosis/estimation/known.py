@@ -141,6 +141,10 @@ class Known(Model):
         """Call the model with its own parameters."""
         return self._inner.change(segment, theta[: self.own], slopes, candidate, values)
 
+    def moved(self, segment: Segment, theta: Array, candidate: Candidate, values: Array) -> Array:
+        """Call the model with its own parameters."""
+        return self._inner.moved(segment, theta[: self.own], candidate, values)
+
     def answer(self, slope: Any, moved: Array) -> Array:
         """Call the model with its own parameters."""
         return self._inner.answer(slope, moved)

@@ -182,6 +182,10 @@ class Model(ABC):
         """Linearized change of outputs (outputs, n) by a candidate at one of the ports of `slopes`."""
         raise KeyError(candidate.port.name)
 
+    def moved(self, segment: Segment, theta: Array, candidate: Candidate, values: Array) -> Array:
+        """Change (n,) of the signal at the port of a candidate, one of `slopes` of a model that is `pointwise`."""
+        raise KeyError(candidate.port.name)
+
     def answer(self, slope: Any, moved: Array) -> Array:
         """Change of outputs (outputs, n) when the signal at a port of `slopes` changes by `moved` (n,)."""
         raise NotImplementedError(f"{self.kind}: no linearized port")

@@ -352,6 +352,10 @@ class RigModel(Model):
 
     def change(self, segment: Segment, theta: Array, slopes: dict[str, Array], candidate: Candidate, values: Array) -> Array:
         """Linearized change of outputs (15, n) by a candidate at an axis, for screening."""
+        return np.asarray(slopes[candidate.port.name] * self.moved(segment, theta, candidate, values))
+
+    def moved(self, segment: Segment, theta: Array, candidate: Candidate, values: Array) -> Array:
+        """Change (n,) by a candidate of the signal that enters its axis."""
         axis = candidate.port.name
         index = AXES.index(axis)
         q = segment.inputs[f"handle_{axis}"]
@@ -359,7 +363,7 @@ class RigModel(Model):
         side = candidate.effect.side
         signal = q if side == "input" else gain * q + theta[2 * index + 1]
         moved = apply_effects(signal, [(candidate, values)], axis, segment, side) - signal
-        return np.asarray(slopes[axis] * (moved if side == "input" else moved / gain))
+        return np.asarray(moved if side == "input" else moved / gain)
 
     def motion(self, segment: Segment, port: Port) -> Array:
         """Handle motion at the axes; else a signal of the port's unit that shows its size."""

@@ -33,6 +33,7 @@ from host.diagnosis.model.dataset import one_clock
 from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, memory_keys, same_place
 from host.diagnosis.model.model import scale_of
 from host.diagnosis.model.operators import fill
+from host.diagnosis.selection.responses import Frame, States, pointwise, states_of
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -154,6 +155,7 @@ class Base:
     Q: Array
     slopes: Slopes
     lines: Array
+    frames: dict[str, Frame] = field(default_factory=dict)  # of ports where outputs answer sample by sample
 
     @cached_property
     def rest(self) -> Array:
@@ -164,6 +166,29 @@ class Base:
     def energy(self) -> float:
         """Squared error of `rest`."""
         return float(self.rest @ self.rest)
+
+    @cached_property
+    def frame(self) -> Frame:
+        """Responses as the stacked residuals have them."""
+        used, rows = [segment for segment in self.problem.segments if segment.fit.any()], len(self.problem.noise)
+        return Frame(self.Q, self.rest, np.cumsum([0, *(rows * int(segment.fit.sum()) for segment in used)]))
+
+    def frame_of(self, port: str) -> Frame:
+        """Responses of the motion at `port` where the outputs answer it sample by sample, else `frame`."""
+        if not self.problem.model.pointwise or port not in self.slopes:
+            return self.frame
+        if port not in self.frames:
+            used = [segment for segment in self.problem.segments if segment.fit.any()]
+            weights = [
+                np.where(np.isfinite(segment.y), np.asarray(slope[port]), 0.0)[:, segment.fit] / self.problem.scale[:, None]
+                for segment, slope in zip(used, self.slopes[port], strict=True)
+            ]
+            self.frames[port] = pointwise(self.Q, self.rest, weights)
+        return self.frames[port]
+
+    def left(self, frame: Frame, response: Array) -> Array:
+        """What `response` (points,) leaves of the residual, past all that is fitted."""
+        return np.asarray(self.rest - frame.stacked(response) + self.Q @ (response @ frame.Q))
 
     @cached_property
     def late_s(self) -> list[float]:
@@ -288,12 +313,16 @@ def _slopes(problem: Problem, fit: Fit) -> Slopes:
 
 
 def _fast(base: Base, term: Term, trial: Array) -> Array:
-    """Weighted change of the outputs by `term`, the last one of `trial`, linearized at its axis."""
-    problem, n = base.problem, len(base.problem.model.parameters)
+    """Weighted change of the outputs by `term`, the last one of `trial`, linearized at its axis: (points,) of its frame."""
+    problem, n, port = base.problem, len(base.problem.model.parameters), term.candidate.port.name
     rows = []
     used = [segment for segment in problem.segments if segment.fit.any()]
-    for segment, S in zip(used, base.slopes[term.candidate.port.name], strict=True):
-        change = problem.model.change(segment, trial[:n], S, term.candidate, trial[-len(term.parameters) :])
+    values = trial[-len(term.parameters) :]
+    if problem.model.pointwise:
+        moved = [problem.model.moved(segment, trial[:n], term.candidate, values)[segment.fit] for segment in used]
+        return base.frame_of(port).of_motion(moved)
+    for segment, S in zip(used, base.slopes[port], strict=True):
+        change = problem.model.change(segment, trial[:n], S, term.candidate, values)
         rows.append(np.where(np.isfinite(segment.y), change, 0.0)[:, segment.fit] / problem.scale[:, None])
     return np.concatenate([row.ravel() for row in rows])
 
@@ -376,11 +405,11 @@ def _scan(base: Base, term: Term) -> list[Point]:
 
     A term with memory gets the state that each recording begins from as further unknowns, and pays for them.
     """
-    problem, values, terms, Q, rest = base.problem, base.values, (*base.terms, term), base.Q, base.rest
+    problem, values, terms = base.problem, base.values, (*base.terms, term)
     points: list[Point] = []
     most_taken = 0.0
     linear = [p for p in term.parameters if p.linear]
-    fast = term.candidate.port.name in base.slopes
+    fast, frame = term.candidate.port.name in base.slopes, base.frame_of(term.candidate.port.name)
     shifts = not linear and not fast and term.candidate.effect.shifts == "time"
     each = len(values) + 2 if shifts else max(len(linear), 1)  # simulations of one point
     most = GRID if fast else problem.model.scan_points
@@ -398,25 +427,26 @@ def _scan(base: Base, term: Term) -> list[Point]:
                 amplitude[p.name] = size_of(p, 0.0)
             trial = np.concatenate((values, starts(term, amplitude, point)))
             columns.append(_fast(base, term, trial) if fast else base.residuals - _known(base, terms, trial))
-        S = _begun(base, term, trial, columns[-1] if fast else None)
+        states = states_of(frame, _begun(base, term, trial, columns[-1] if fast else None))
+        begun = len(states.best)
         if shifts:
-            again = _absorbed(base, terms, trial, S)
+            again = _absorbed(base, terms, trial, states)
             if again is not None:
                 found, left = again
                 taken = base.energy - float(left @ left)
                 own = point is deepest
-                points.append(Point(taken, found[values.size :], left, found[: values.size], S.shape[1], own))
+                points.append(Point(taken, found[values.size :], left, found[: values.size], begun, own))
             continue
         if term.candidate.effect.memories:  # it is nothing but what each recording begins with
-            left = rest - S @ (S.T @ rest)
-            points.append(Point(base.energy - float(left @ left), starts(term, {}, point), left, None, S.shape[1]))
+            left = base.left(frame, states.best @ states.responses)
+            points.append(Point(states.taken, starts(term, {}, point), left, None, begun))
             continue
         D = np.array(columns)
-        D, r = D - (D @ S) @ S.T, rest - S @ (S.T @ rest)
-        B = D @ Q
-        G, g = D @ D.T - B @ B.T, D @ r
+        energy, B = np.einsum("rp,rp->r", D, D), D @ frame.Q
+        N = states.along(D, B)
+        G, g = D @ D.T - B @ B.T - N @ states.inverse @ N.T, D @ frame.rest - N @ states.best
         size = np.sqrt(np.maximum(np.diag(G), 1e-300))
-        if not np.all(np.isfinite(G)) or float(np.max(np.diag(G) / (np.sum(D * D, axis=1) + 1e-300))) < ABSORBED:
+        if not np.all(np.isfinite(G)) or float(np.max(np.diag(G) / (energy + 1e-300))) < ABSORBED:
             continue
         a = _solved(G / np.outer(size, size), g / size) / size
         if linear:
@@ -426,12 +456,13 @@ def _scan(base: Base, term: Term) -> list[Point]:
             )
         elif not 0.2 < a[0] < 5.0:
             continue
-        taken = float(2.0 * a @ g - a @ G @ a) + (base.energy - float(r @ r))
+        taken = float(2.0 * a @ g - a @ G @ a) + states.taken
         amplitude = {p.name: float(x) * size_of(p, 0.0) for x, p in zip(a, linear, strict=False)}
-        left = rest
+        left = base.rest
         if taken > most_taken:
-            most_taken, left = taken, r - (a @ D - Q @ (B.T @ a))
-        points.append(Point(taken, starts(term, amplitude, point), left, None, S.shape[1]))
+            most_taken = taken
+            left = base.left(frame, a @ D + (states.best - states.inverse @ (a @ N)) @ states.responses)
+        points.append(Point(taken, starts(term, amplitude, point), left, None, begun))
     return points
 
 
@@ -447,18 +478,18 @@ def _known(base: Base, terms: tuple[Term, ...], trial: Array) -> Array:
 
 
 def _begun(base: Base, term: Term, trial: Array, now: Array | None) -> Array:
-    """What the state at a recording's first sample does of the memory of `term`: orthonormal columns, one a recording.
+    """What the states at recordings' first samples do of the memory of `term`: (states, points) of its frame.
 
-    They are orthogonal to `Q` too, so that they and the term share the residual. Without them an effect with a long memory
-    is taken for what it would be if the first samples had told its state.
+    They and the term share the residual. Without them an effect with a long memory is taken for what it would be if the
+    first samples had told its state.
 
     now: the term's response with the states so far, where the model answers without a simulation.
     """
     problem, candidate = base.problem, term.candidate
-    none = np.zeros((base.Q.shape[0], 0))
+    port, frame = candidate.port.name, base.frame_of(candidate.port.name)
     if not candidate.effect.remembers or not candidate.effect.timed:
-        return none  # a memory of places, not of times, is soon overwritten
-    port, before, keys = candidate.port.name, get_starts(problem), memory_keys(candidate)
+        return np.zeros((0, frame.rest.size))  # a memory of places, not of times, is soon overwritten
+    before, keys = get_starts(problem), memory_keys(candidate)
     used = [segment for segment in problem.segments if segment.fit.any()]
     spread = (
         float(np.std(np.concatenate([problem.model.motion(segment, candidate.port)[segment.fit] for segment in used])))
@@ -471,24 +502,18 @@ def _begun(base: Base, term: Term, trial: Array, now: Array | None) -> Array:
         return -problem.stacked((*base.terms, term), trial)
 
     now = response() if now is None else now
-    rows = len(problem.noise)
-    edges = np.cumsum([0] + [rows * int(segment.fit.sum()) for segment in used])
-    columns = np.zeros((now.size, len(keys) * len(used)))
+    rows = np.zeros((len(keys) * len(used), now.size))
     for number, key in enumerate(keys):
         for segment in used:
             segment.start[key] = segment.start.get(key, 0.0) + START_STEP * spread
         change = response() - now
         set_starts(problem, before)
-        for index, (first, last) in enumerate(itertools.pairwise(edges)):
-            columns[first:last, number * len(used) + index] = change[first:last]
-    most = float(np.max(np.sum(columns**2, axis=0), initial=0.0)) ** 0.5
-    columns -= base.Q @ (base.Q.T @ columns)
-    size = np.sqrt(np.sum(columns**2, axis=0))
-    seen = np.flatnonzero(size > 1e-9 * max(most, 1e-300))
-    return np.asarray(np.linalg.qr(columns[:, seen])[0]) if seen.size else none
+        for index, (first, last) in enumerate(itertools.pairwise(frame.edges)):
+            rows[number * len(used) + index, first:last] = change[first:last]
+    return rows
 
 
-def _absorbed(base: Base, terms: tuple[Term, ...], trial: Array, S: Array) -> tuple[Array, Array] | None:
+def _absorbed(base: Base, terms: tuple[Term, ...], trial: Array, states: States) -> tuple[Array, Array] | None:
     """All parameters fitted again from a shift in time at a grid point, and the residual then; None where they cannot be.
 
     Rates of the nominal model take most of a small delay. Next to one that is fitted they have to give it back first: a
@@ -496,6 +521,7 @@ def _absorbed(base: Base, terms: tuple[Term, ...], trial: Array, S: Array) -> tu
     a delay of a part of a sample lies between the points of the grid.
     """
     problem, r = base.problem, _known(base, terms, trial)
+    S = np.linalg.qr(states.responses.T - base.Q @ states.rates.T)[0]  # orthonormal, past all that is fitted
     parameters = problem.parameters(terms)
     sizes = [size_of(p, v) for p, v in zip(parameters, trial, strict=True)]
     J, aim = jacobian(problem, terms, trial, problem.stacked(terms, trial), sizes), r - S @ (S.T @ r)
