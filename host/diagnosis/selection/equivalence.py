@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from host.diagnosis.estimation.evidence import Gain, correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
+from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts, size_of
 from host.diagnosis.estimation.initial_state import begun_again
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
@@ -285,16 +285,10 @@ def _equals(
         other = minimize(problem, (*less.terms, term), begin, rounds=10, tolerance=1e-4)
         other = finish(problem, begun_again(problem, other))
         set_starts(problem, begun)
-        contained = candidate.effect.id in trial.candidate.effect.contains
-        if contained and (at_bound(other) or _collapsed(problem, best, other)):
+        compared = _another(problem, best, candidate, other)
+        if compared is None:
             continue
-        if at_bound(other) and other.fitted > best.fitted:
-            family = candidate.effect.family
-            if trial.candidate.name == candidate.name or contained or not family or trial.candidate.effect.family != family:
-                continue
-            other = _inside(problem, other)  # at the bound it may say what the simpler one says
-            if problem.gain("both", other.residuals, best.residuals).log_likelihood > problem.rules.equal_log_likelihood:
-                continue
+        other = compared
         names.remove(trial.candidate.name)
         ahead = problem.gain("both", other.residuals, best.residuals)
         held = problem.gain("heldout", other.residuals, best.residuals)
@@ -308,6 +302,27 @@ def _equals(
     return tuple(kept), refitted
 
 
+def _another(problem: Problem, best: Fit, candidate: Candidate, rival: Fit) -> Fit | None:
+    """`rival`, or another fit of it that the data allow as well, where it ended as a simpler effect; None if there is none.
+
+    At a bound, or as the effect of `candidate` that it contains, it is no other explanation. An effect of one family may be
+    one all the same: with its shape inside the bounds, or with more of what distinguishes it, it may do as well as `best`.
+    """
+    other = rival.terms[-1].candidate
+    contained = candidate.effect.id in other.effect.contains
+    simpler = contained and (at_bound(rival) or _collapsed(problem, best, rival))
+    if not simpler and not (at_bound(rival) and rival.fitted > best.fitted):
+        return rival
+    alike = bool(candidate.effect.family) and other.effect.family == candidate.effect.family
+    if not alike or other.name == candidate.name or (contained and not simpler):
+        return None
+    held = _enlarged(problem, rival) if simpler else _inside(problem, rival)
+    if held is None or (simpler and at_bound(held)):
+        return None
+    behind = problem.gain("both", held.residuals, best.residuals).log_likelihood
+    return held if behind <= problem.rules.equal_log_likelihood else None
+
+
 def _inside(problem: Problem, fit: Fit) -> Fit:
     """`fit` with each shape of its last term that ended at a bound held at the best of the values that are tried first.
 
@@ -315,19 +330,33 @@ def _inside(problem: Problem, fit: Fit) -> Fit:
     """
     for k, p in enumerate(fit.terms[-1].parameters):
         term = fit.terms[-1]
-        place = fit.first_of(term) + k
-        if p.linear or not reached(p, float(fit.values[place]), term.candidate.effect.natural_bounds):
+        if p.linear or not reached(p, float(fit.values_of(term)[k]), term.candidate.effect.natural_bounds):
             continue
-        held = []
-        for value in p.grid:
-            begin = fit.values.copy()
-            begin[place] = value
-            parameters = (*term.parameters[:k], replace(p, low=value, high=value), *term.parameters[k + 1 :])
-            terms = (*fit.terms[:-1], replace(term, parameters=parameters))
-            other = minimize(problem, terms, begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
-            held.append(finish(problem, other))
-        fit = max(held, key=lambda other: problem.gain("both", fit.residuals, other.residuals).log_likelihood)
+        fit = _likeliest(problem, fit, [_held(problem, fit, k, value) for value in p.grid])
     return fit
+
+
+def _enlarged(problem: Problem, fit: Fit) -> Fit | None:
+    """`fit` with a further amount of its last term held at the size that is tried first; None if it has one amount only.
+
+    The term ended as a simpler effect that it contains. If it is as likely with an amount that changes the law plainly, the
+    data leave that amount open: nominal parameters take up what it does.
+    """
+    amounts = [(k, size_of(p, 0.0)) for k, p in enumerate(fit.terms[-1].parameters) if p.linear]
+    return _likeliest(problem, fit, [_held(problem, fit, k, size) for k, size in amounts[1:]]) if len(amounts) > 1 else None
+
+
+def _held(problem: Problem, fit: Fit, k: int, value: float) -> Fit:
+    """`fit` with parameter `k` of its last term held at `value`."""
+    term, begin = fit.terms[-1], fit.values.copy()
+    begin[fit.first_of(term) + k] = value
+    p = replace(term.parameters[k], low=value, high=value)
+    terms = (*fit.terms[:-1], replace(term, parameters=(*term.parameters[:k], p, *term.parameters[k + 1 :])))
+    return finish(problem, minimize(problem, terms, begin, rounds=problem.rules.further_iterations, tolerance=1e-4))
+
+
+def _likeliest(problem: Problem, than: Fit, fits: list[Fit]) -> Fit:
+    return max(fits, key=lambda fit: problem.gain("both", than.residuals, fit.residuals).log_likelihood)
 
 
 def _elsewhere(rival: Candidate, candidate: Candidate) -> bool:
