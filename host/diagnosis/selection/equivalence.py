@@ -342,17 +342,29 @@ def _enlarged(problem: Problem, fit: Fit) -> Fit | None:
     The term ended as a simpler effect that it contains. If it is as likely with an amount that changes the law plainly, the
     data leave that amount open: nominal parameters take up what it does.
     """
-    amounts = [(k, size_of(p, 0.0)) for k, p in enumerate(fit.terms[-1].parameters) if p.linear]
-    return _likeliest(problem, fit, [_held(problem, fit, k, size) for k, size in amounts[1:]]) if len(amounts) > 1 else None
+    parameters = fit.terms[-1].parameters
+    amounts = [(k, size_of(p, 0.0)) for k, p in enumerate(parameters) if p.linear]
+    first, held = fit.first_of(fit.terms[-1]), []
+    for k, size in amounts[1:]:
+        begins = [fit]
+        for shape, p in enumerate(parameters):  # with none of this amount, its shape ended anywhere
+            for value in () if p.linear else p.grid:
+                values = fit.values.copy()
+                values[first + shape] = value
+                begins.append(replace(fit, values=values))
+        tried = [_held(problem, begin, k, size, problem.rules.first_iterations) for begin in begins]
+        held.append(_held(problem, _likeliest(problem, fit, tried), k, size))
+    return _likeliest(problem, fit, held) if held else None
 
 
-def _held(problem: Problem, fit: Fit, k: int, value: float) -> Fit:
-    """`fit` with parameter `k` of its last term held at `value`."""
+def _held(problem: Problem, fit: Fit, k: int, value: float, rounds: int = 0) -> Fit:
+    """`fit` with parameter `k` of its last term held at `value`. rounds: iterations; 0: those of a last fit."""
     term, begin = fit.terms[-1], fit.values.copy()
     begin[fit.first_of(term) + k] = value
     p = replace(term.parameters[k], low=value, high=value)
     terms = (*fit.terms[:-1], replace(term, parameters=(*term.parameters[:k], p, *term.parameters[k + 1 :])))
-    return finish(problem, minimize(problem, terms, begin, rounds=problem.rules.further_iterations, tolerance=1e-4))
+    rounds = rounds or problem.rules.further_iterations
+    return finish(problem, minimize(problem, terms, begin, rounds=rounds, tolerance=1e-4))
 
 
 def _likeliest(problem: Problem, than: Fit, fits: list[Fit]) -> Fit:

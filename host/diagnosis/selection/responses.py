@@ -19,11 +19,11 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 SEEN = 1e-12  # share of the largest energy of a state's response that has to be left past `Q`
-APART = 1e-10  # smallest eigenvalue of states of unit size that are told apart
+APART = 1e-10  # smallest eigenvalue of states of unit size that are separate
 
 
 @dataclass(frozen=True)
-class Frame:
+class ResponseFrame:
     """Points in which responses are compared with a residual.
 
     Q: (points, columns), rest: (points,), of what is fitted and of the residual past it; edges: (recordings + 1,), first
@@ -52,7 +52,7 @@ class Frame:
         return np.concatenate(parts)
 
 
-def pointwise(Q: Array, rest: Array, weights: list[Array]) -> Frame:
+def pointwise(Q: Array, rest: Array, weights: list[Array]) -> ResponseFrame:
     """The frame of responses with `weights` (outputs, samples) of each recording. Q and rest: of the stacked residuals."""
     sizes = tuple(np.sqrt(np.einsum("rt,rt->t", w, w)) for w in weights)
     units = tuple(w / np.where(size > 0.0, size, 1.0) for w, size in zip(weights, sizes, strict=True))
@@ -60,7 +60,7 @@ def pointwise(Q: Array, rest: Array, weights: list[Array]) -> Frame:
     along = [np.einsum("rt,rtk->tk", u, part.reshape(*u.shape, -1)) for u, part in zip(units, parts, strict=True)]
     both = np.concatenate(along)
     edges = np.cumsum([0, *(size.size for size in sizes)])
-    return Frame(np.ascontiguousarray(both[:, :-1]), both[:, -1].copy(), edges, units, sizes)
+    return ResponseFrame(np.ascontiguousarray(both[:, :-1]), both[:, -1].copy(), edges, units, sizes)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class States:
     rates: with `Q` (states, columns); inverse: of their normal equations; best: what they are without any response.
     """
 
-    frame: Frame
+    frame: ResponseFrame
     responses: Array
     rates: Array
     inverse: Array
@@ -89,7 +89,7 @@ class States:
         return np.asarray(D @ self.responses.T - DQ @ self.rates.T)
 
 
-def states_of(frame: Frame, responses: Array) -> States:
+def states_of(frame: ResponseFrame, responses: Array) -> States:
     """States that are seen past what is fitted, of `responses` (states, points)."""
     raw = np.einsum("sp,sp->s", responses, responses)
     rates = responses @ frame.Q

@@ -33,7 +33,7 @@ from host.diagnosis.model.dataset import one_clock
 from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, memory_keys, same_place
 from host.diagnosis.model.model import scale_of
 from host.diagnosis.model.operators import fill
-from host.diagnosis.selection.responses import Frame, States, pointwise, states_of
+from host.diagnosis.selection.responses import ResponseFrame, States, pointwise, states_of
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -155,7 +155,7 @@ class Base:
     Q: Array
     slopes: Slopes
     lines: Array
-    frames: dict[str, Frame] = field(default_factory=dict)  # of ports where outputs answer sample by sample
+    frames: dict[str, ResponseFrame] = field(default_factory=dict)  # of ports where outputs answer sample by sample
 
     @cached_property
     def rest(self) -> Array:
@@ -168,12 +168,12 @@ class Base:
         return float(self.rest @ self.rest)
 
     @cached_property
-    def frame(self) -> Frame:
+    def frame(self) -> ResponseFrame:
         """Responses as the stacked residuals have them."""
         used, rows = [segment for segment in self.problem.segments if segment.fit.any()], len(self.problem.noise)
-        return Frame(self.Q, self.rest, np.cumsum([0, *(rows * int(segment.fit.sum()) for segment in used)]))
+        return ResponseFrame(self.Q, self.rest, np.cumsum([0, *(rows * int(segment.fit.sum()) for segment in used)]))
 
-    def frame_of(self, port: str) -> Frame:
+    def frame_of(self, port: str) -> ResponseFrame:
         """Responses of the motion at `port` where the outputs answer it sample by sample, else `frame`."""
         if not self.problem.model.pointwise or port not in self.slopes:
             return self.frame
@@ -186,7 +186,7 @@ class Base:
             self.frames[port] = pointwise(self.Q, self.rest, weights)
         return self.frames[port]
 
-    def left(self, frame: Frame, response: Array) -> Array:
+    def left(self, frame: ResponseFrame, response: Array) -> Array:
         """What `response` (points,) leaves of the residual, past all that is fitted."""
         return np.asarray(self.rest - frame.stacked(response) + self.Q @ (response @ frame.Q))
 

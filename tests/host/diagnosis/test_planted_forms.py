@@ -312,6 +312,27 @@ def test_a_fall_of_friction_that_the_recordings_hardly_show_stays_open() -> None
     assert effect["indistinguishable_from"] == ["stribeck_friction@pad"]
 
 
+def test_a_fall_of_friction_that_the_damping_takes_up_stays_open() -> None:
+    """The friction falls slowly over all speeds: a constant one with less damping does as well, and says so."""
+
+    def rubbing(t: Array, x: Array, normal: Array) -> Array:
+        v = np.gradient(x, 1e-3)
+        return np.asarray((0.02 + 0.03 * np.exp(-((v / 1.5e-2) ** 2))) * np.tanh(v / 2e-4))
+
+    (effect,) = diagnose([pressed(seed, 8.0, rubbing) for seed in (1, 2, 3)], PRESSED).as_dict()["effects"]
+    assert effect["id"] == "coulomb_friction" and effect["probability"] < 0.9
+    assert "stribeck_friction@pad" in effect["indistinguishable_from"]
+
+
+def test_a_constant_friction_that_the_recordings_show_well_has_no_equal() -> None:
+    def rubbing(t: Array, x: Array, normal: Array) -> Array:
+        return np.asarray(0.2 * np.tanh(np.gradient(x, 1e-3) / 2e-4))
+
+    (effect,) = diagnose([pressed(seed, 8.0, rubbing) for seed in (1, 2, 3)], PRESSED).as_dict()["effects"]
+    assert effect["id"] == "coulomb_friction" and effect["probability"] > 0.9
+    assert not effect["indistinguishable_from"]
+
+
 def test_a_mass_is_slowed_by_a_friction_that_falls_without_a_corner() -> None:
     def moving(seed: int) -> dict[str, Array]:
         t, rng = np.arange(0.0, 12.0, 5e-3), np.random.default_rng([seed, 6])
