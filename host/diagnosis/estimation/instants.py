@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
+from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize, robust
 
 Array = npt.NDArray[np.float64]
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
@@ -64,6 +64,8 @@ def _split_again(problem: Problem, fit: Fit) -> Fit:
         trial = fit.values.copy()
         trial[index] = float(np.clip(0.5 * (time_s[best - 1] + time_s[best]), p.low, p.high))
         if abs(trial[index] - at) < FITTED * problem.segments[0].recording.dt_s:
+            continue
+        if not robust(problem.stacked(fit.terms, trial))[0] < fit.cost:
             continue
         other = minimize(problem, fit.terms, trial, rounds=problem.rules.further_iterations, tolerance=1e-4)
         if other.cost < fit.cost:
@@ -120,7 +122,7 @@ def instant_interval(problem: Problem, fit: Fit, index: int, level: float) -> tu
 def _least(problem: Problem, fit: Fit, values: Array, index: int, low: float, high: float) -> float:
     """The value of parameter `index` between `low` and `high` (s) at which all samples between them leave least."""
     near = [(s.fit | s.heldout) & (s.recording.time_s >= low) & (s.recording.time_s <= high) for s in problem.segments]
-    segments = [replace(s, fit=m if s.fit.any() else s.fit) for s, m in zip(problem.segments, near, strict=True)]
+    segments = [replace(s, fit=m) for s, m in zip(problem.segments, near, strict=True)]
     whole = replace(problem, segments=segments)
 
     def left(at: float) -> float:
