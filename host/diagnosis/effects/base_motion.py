@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from host.diagnosis.effects.periodic_disturbance import PHASE, oscillation
@@ -20,13 +18,14 @@ def beat(s: Scale, form: str) -> tuple[Parameter, ...]:
     pairs = tuple(Parameter(f"{part}_{a}", "m", (1e-3,), linear=True) for a in "xyz" for part in ("sine", "cosine"))
     top = min(0.2 / s.dt_s, 4.0)
     grid = lines(s, 2.0 / s.duration_s, top, 0.5)
-    return (*pairs, Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+    step = 0.1 / s.duration_s
+    return (*pairs, Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, spectral=True, step=step))
 
 
 def line(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes along the base axes of a motion on one line, its phase and frequency."""
-    frequency = replace(beat(s, form)[-1], spectral=True)
-    return (*(Parameter(f"amplitude_{a}", "m", (2e-5,), linear=True) for a in "xyz"), PHASE, frequency)
+    amplitudes = (Parameter(f"amplitude_{a}", "m", (2e-5,), linear=True) for a in "xyz")
+    return (*amplitudes, PHASE, beat(s, form)[-1])
 
 
 def rock(s: Scale, form: str) -> tuple[Parameter, ...]:

@@ -13,7 +13,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
         Parameter(f"{part}_{a}", "N/m", (0.05,), linear=True) for a in "xy" for part in ("steady", "sine", "cosine")
     )
     grid = lines(s, 0.3, min(3.0, 0.4 / s.dt_s), 0.5)
-    return (*parts, Parameter("frequency", "Hz", grid, 0.1, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+    return (*parts, Parameter("frequency", "Hz", grid, 0.1, 0.45 / s.dt_s, spectral=True, step=0.1 / s.duration_s))
 
 
 def apply(state: dict, c: Context, p: Array, form: str) -> dict:
