@@ -175,7 +175,10 @@ class Model(ABC):
         raise NotImplementedError(f"{self.kind}: outputs do not answer sample by sample")
 
     def slopes(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, Any]:
-        """Return the data for `change`, by port, for ports whose candidates can be screened without a simulation."""
+        """Return the data for `change`, by port, for ports whose candidates can be screened without a simulation.
+
+        Of a model that is `pointwise` it is the `sensitivity`, and a candidate's change is that times what it has `moved`.
+        """
         return {}
 
     def change(self, segment: Segment, theta: Array, slopes: dict[str, Any], candidate: Candidate, values: Array) -> Array:

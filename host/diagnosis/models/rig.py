@@ -350,10 +350,6 @@ class RigModel(Model):
         """Sensitivity of the outputs (15, n) to each axis."""
         return {axis: self.sensitivity(segment, theta, axis, active) for axis in AXES}
 
-    def change(self, segment: Segment, theta: Array, slopes: dict[str, Array], candidate: Candidate, values: Array) -> Array:
-        """Linearized change of outputs (15, n) by a candidate at an axis, for screening."""
-        return np.asarray(slopes[candidate.port.name] * self.moved(segment, theta, candidate, values))
-
     def moved(self, segment: Segment, theta: Array, candidate: Candidate, values: Array) -> Array:
         """Change (n,) by a candidate of the signal that enters its axis."""
         axis = candidate.port.name

@@ -31,7 +31,7 @@ from host.diagnosis.estimation.fit import (
 )
 from host.diagnosis.model.dataset import one_clock
 from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, memory_keys, same_place
-from host.diagnosis.model.model import scale_of
+from host.diagnosis.model.model import Segment, scale_of
 from host.diagnosis.model.operators import fill
 from host.diagnosis.selection.responses import ResponseFrame, States, pointwise, states_of
 
@@ -168,20 +168,24 @@ class Base:
         return float(self.rest @ self.rest)
 
     @cached_property
+    def used(self) -> list[Segment]:
+        """The recordings to fit, which the stacked residuals are of."""
+        return [segment for segment in self.problem.segments if segment.fit.any()]
+
+    @cached_property
     def frame(self) -> ResponseFrame:
         """Responses as the stacked residuals have them."""
-        used, rows = [segment for segment in self.problem.segments if segment.fit.any()], len(self.problem.noise)
-        return ResponseFrame(self.Q, self.rest, np.cumsum([0, *(rows * int(segment.fit.sum()) for segment in used)]))
+        rows = len(self.problem.noise)
+        return ResponseFrame(self.Q, self.rest, np.cumsum([0, *(rows * int(segment.fit.sum()) for segment in self.used)]))
 
     def frame_of(self, port: str) -> ResponseFrame:
         """Responses of the motion at `port` where the outputs answer it sample by sample, else `frame`."""
         if not self.problem.model.pointwise or port not in self.slopes:
             return self.frame
         if port not in self.frames:
-            used = [segment for segment in self.problem.segments if segment.fit.any()]
             weights = [
                 np.where(np.isfinite(segment.y), np.asarray(slope[port]), 0.0)[:, segment.fit] / self.problem.scale[:, None]
-                for segment, slope in zip(used, self.slopes[port], strict=True)
+                for segment, slope in zip(self.used, self.slopes[port], strict=True)
             ]
             self.frames[port] = pointwise(self.Q, self.rest, weights)
         return self.frames[port]
@@ -198,11 +202,10 @@ class Base:
         delays of whole samples are compared: columns X of the outputs and their rates, shifted by d, leave
         y'y - c' (X'X)^-1 c of the measured y, where c(d) = sum over t of y(t) X(t - d) is a correlation.
         """
-        used = [segment for segment in self.problem.segments if segment.fit.any()]
-        longest, columns, first = max(segment.n for segment in used) // 4, self.Q.shape[1] + 1, 0
+        longest, columns, first = max(segment.n for segment in self.used) // 4, self.Q.shape[1] + 1, 0
         products, squares = np.zeros((longest, columns)), np.zeros((longest, columns, columns))
         energy, counted = np.zeros(longest), np.zeros(longest)
-        for segment in used:
+        for segment in self.used:
             n = int(segment.fit.sum())
             lags = min(longest, n)
             size = 1 << int(np.ceil(np.log2(2 * n)))
@@ -315,13 +318,11 @@ def _slopes(problem: Problem, fit: Fit) -> Slopes:
 def _fast(base: Base, term: Term, trial: Array) -> Array:
     """Weighted change of the outputs by `term`, the last one of `trial`, linearized at its axis: (points,) of its frame."""
     problem, n, port = base.problem, len(base.problem.model.parameters), term.candidate.port.name
-    rows = []
-    used = [segment for segment in problem.segments if segment.fit.any()]
-    values = trial[-len(term.parameters) :]
-    if problem.model.pointwise:
-        moved = [problem.model.moved(segment, trial[:n], term.candidate, values)[segment.fit] for segment in used]
-        return base.frame_of(port).of_motion(moved)
-    for segment, S in zip(used, base.slopes[port], strict=True):
+    values, frame, rows = trial[-len(term.parameters) :], base.frame_of(port), []
+    if frame.units:
+        moved = [problem.model.moved(segment, trial[:n], term.candidate, values)[segment.fit] for segment in base.used]
+        return frame.of_motion(moved)
+    for segment, S in zip(base.used, base.slopes[port], strict=True):
         change = problem.model.change(segment, trial[:n], S, term.candidate, values)
         rows.append(np.where(np.isfinite(segment.y), change, 0.0)[:, segment.fit] / problem.scale[:, None])
     return np.concatenate([row.ravel() for row in rows])
@@ -489,8 +490,7 @@ def _begun(base: Base, term: Term, trial: Array, now: Array | None) -> Array:
     port, frame = candidate.port.name, base.frame_of(candidate.port.name)
     if not candidate.effect.remembers or not candidate.effect.timed:
         return np.zeros((0, frame.rest.size))  # a memory of places, not of times, is soon overwritten
-    before, keys = get_starts(problem), memory_keys(candidate)
-    used = [segment for segment in problem.segments if segment.fit.any()]
+    before, keys, used = get_starts(problem), memory_keys(candidate), base.used
     spread = (
         float(np.std(np.concatenate([problem.model.motion(segment, candidate.port)[segment.fit] for segment in used])))
         or 1.0
