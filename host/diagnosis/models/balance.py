@@ -29,9 +29,10 @@ from host.diagnosis.model.force_kernel import (
     OMEGA2,
     STRIBECK_D,
     along,
+    second_mass,
 )
 from host.diagnosis.model.model import Segment
-from host.diagnosis.model.operators import reading_noise, signal_band, white_level
+from host.diagnosis.model.operators import followed, reading_noise, signal_band, white_level
 
 Array = npt.NDArray[np.float64]
 POWER = 4  # of the bump: its second derivative is smooth at the ends
@@ -261,6 +262,13 @@ def _forces(segment: Segment, motion: Motion, p: Array) -> Array:
     )
 
 
+def _without(p: Array, *slots: int) -> Array:
+    """`p` with zero in `slots`."""
+    less = p.copy()
+    less[list(slots)] = 0.0
+    return less
+
+
 def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, force: Array, p: Array) -> Array:
     """Force (1, n) that the motion needs beyond the input. linear: m, c, k, offset; p: slots of the force kernel.
 
@@ -273,12 +281,10 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
     a, v, x = balance.rows
     need = linear[0] * a + linear[1] * v + linear[2] * x - linear[3]
     if np.any(p):
-        dry = _forces(segment, motion, p)
+        dry = _forces(segment, motion, _without(p, MASS2))
         most = p[COULOMB] + max(p[EXCESS], 0.0)
         if p[COULOMB] > 0.0 and p[STRIBECK_D] <= 0.0 and motion.rests.any():
-            smooth = p.copy()
-            smooth[COULOMB] = smooth[EXCESS] = 0.0
-            other = _forces(segment, motion, smooth)
+            other = _forces(segment, motion, _without(p, COULOMB, EXCESS, MASS2))
             holds = np.clip(motion.pushed + linear[3] - linear[2] * motion.x - other, -most, most)
             dry = np.where(motion.rests, other + holds, dry)
         need = need + balance.bump.along(dry)
@@ -288,7 +294,34 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
         applied = _finely(balance, recording.dt_s, finer, force.size).along(force)[::finer]
         size = _passed(applied, balance.recorded, np.isfinite(segment.y[0]))
     size *= min(quieted(balance, linear, p, recording.dt_s), 1.0)
-    return np.asarray(need - applied)[None, :] / min(max(size, 1e-6), 1.0)
+    left = need - applied
+    if p[MASS2] > 0.0:
+        left = left + _pull_of_second_mass(balance, segment, p, left)
+    return np.asarray(left)[None, :] / min(max(size, 1e-6), 1.0)
+
+
+def _pull_of_second_mass(balance: Balance, segment: Segment, p: Array, left: Array) -> Array:
+    """Force (n,) of the second mass under the test function; left (n,): error without it.
+
+    It follows from the acceleration under the test function: a smoothed one would lack what is fast. How the mass moved
+    before is not known. Its free oscillation is fitted to the error, and is expected to be as large as its forced one.
+    """
+    first, dt_s, omega = balance.support.size // 2, segment.recording.dt_s, p[OMEGA2]
+    pull = np.zeros(segment.n)
+    pull[first:] = second_mass(balance.rows[0][first:], dt_s, p)
+    seen = np.isfinite(segment.y[0])
+    usual = float(np.std(pull[seen])) if seen.any() else 0.0
+    if usual == 0.0:
+        return pull
+    free = np.zeros((segment.n, 2))
+    still = np.zeros(segment.n - first)
+    for column, begun in enumerate(((1.0, 0.0), (0.0, omega))):
+        free[first:, column] = usual * followed(still, dt_s, 2.0 * p[DAMPING2] / omega, 1.0 / omega**2, *begun)
+    error, by = left + pull, np.zeros(2)
+    for _ in range(2):
+        variance = float(np.mean((error + free @ by)[seen] ** 2))
+        by = np.linalg.solve(free[seen].T @ free[seen] + variance * np.eye(2), -free[seen].T @ error[seen])
+    return np.asarray(pull + free @ by)
 
 
 def _passed(applied: Array, recorded: Array, compared: npt.NDArray[np.bool_]) -> float:

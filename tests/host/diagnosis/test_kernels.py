@@ -116,6 +116,20 @@ def test_forces_along_a_motion_add_up() -> None:
     assert np.allclose(one + two, both) and np.allclose(one, 2 * v)
 
 
+@pytest.mark.parametrize("frequency_Hz", [1.0, 4.0, 8.0])
+def test_a_second_mass_pulls_along_a_fast_motion_as_its_transfer_function_does(frequency_Hz: float) -> None:
+    """A motion that was held for each sample led the mass by half of one: its spring pulled in proportion to the speed."""
+    t, omega = np.arange(0, 8, 0.01), 2.0 * np.pi * frequency_Hz
+    own, ratio, mass = 2.0 * np.pi * 5.8, 0.2, 0.3
+    x, v, a = np.sin(omega * t), omega * np.cos(omega * t), -(omega**2) * np.sin(omega * t)
+    p = slot_array([{"second_mass": mass, "second_omega": own, "second_damping": ratio}])
+    pull = along(x, v, a, np.zeros(t.size), t, 0.01, 1e-3, 0.0, p)
+    s = 1j * omega
+    law = mass * s**2 * (2.0 * ratio * own * s + own**2) / (s**2 + 2.0 * ratio * own * s + own**2)
+    wanted = np.imag(law * np.exp(s * t))
+    assert np.max(np.abs(pull - wanted)[300:]) < 0.004 * np.max(np.abs(wanted))
+
+
 def shape(
     d: float, roll: float, kappa: float, force: np.ndarray, load: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> tuple[np.ndarray, ...]:
