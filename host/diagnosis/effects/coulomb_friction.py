@@ -19,13 +19,16 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Friction force; second form: and the distance, far below the travel, over which what touches yields; third: and the
-    speed below which friction grows with speed, as that of a lubricated or simulated contact.
+    speed below which friction grows with speed, as that of a lubricated or simulated contact; fourth: and the power by which
+    it does so.
     """
     level = Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True)
     if form == "":
         return (level,)
     if form == "smooth":
         return (level, rising(s))
+    if form == "gradual":
+        return (level, rising(s), Parameter("power", "", (1.8,), 0.5, 5.0, log=True))
     low, high = 1e-5 * s.motion_span, BRISTLES * s.motion_span
     return (level, Parameter("distance", s.motion_unit, spread(3.0 * low, 0.6 * high, 3), low, high, log=True))
 
@@ -56,6 +59,8 @@ def slots(p: Array, form: str) -> dict[str, float]:
     """Level of the sliding force, and the distance of its bristles or the speed at which it is nearly reached."""
     if form == "smooth":
         return {"smooth": p[0], "smooth_speed": p[1]}
+    if form == "gradual":
+        return {"smooth": p[0], "smooth_speed": p[1], "smooth_power": p[2]}
     return {"presliding": p[0], "presliding_distance": p[1]} if form == "bristles" else {"coulomb": p[0]}
 
 
@@ -112,4 +117,10 @@ EFFECTS = (
         "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
     ),
     replace(_RISING, timed=True, remembers=False, rounded=True),
+    replace(
+        in_form(_RISING, "gradual", _RISING.says, "F = force*v/(speed^power + |v|^power)^(1/power)"),
+        timed=True,
+        remembers=False,
+        rounded=True,
+    ),
 )

@@ -61,6 +61,7 @@ SLOTS = (
     "added_mass",
     "smooth_excess",
     "smooth_stribeck",
+    "smooth_power",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -112,6 +113,7 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     ADDED_MASS,
     SMOOTH_EXCESS,
     SMOOTH_STRIBECK,
+    SMOOTH_POWER,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
@@ -206,34 +208,50 @@ def _smooth_level(v: float, p: Array) -> float:
 @njit(cache=True)
 def _rising(v: float, load: float, p: Array) -> float:
     """Friction at speed v of the laws that rise with speed, one of which follows the load; nothing where there is none."""
-    force = _smooth_level(v, p) * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
+    force = _smooth_level(v, p) * _risen(v / p[SMOOTH_SPEED], p[SMOOTH_POWER])[0] if p[SMOOTH_SPEED] > 0.0 else 0.0
     if p[LOAD_SMOOTH_SPEED] > 0.0:
         force += p[LOAD_SMOOTH] * abs(load - p[LOAD_ZERO]) * math.tanh(v / p[LOAD_SMOOTH_SPEED])
     return force
 
 
 @njit(cache=True)
-def _slowed(v_free: float, lost: float, rise: float) -> float:
-    """Speed v with v + lost*tanh(v/rise) = v_free: friction that rises with speed over one step, by Newton's method.
+def _risen(u: float, power: float) -> tuple[float, float]:
+    """Share of friction that there is at `u` times the speed below which it rises, and its derivative by u.
+
+    power: u / (1 + abs(u)^power)^(1/power), or tanh(u) where it is 0. It approaches 1 the more slowly the smaller it is.
+    """
+    if power <= 0.0:
+        bent = math.tanh(u)
+        return bent, 1.0 - bent * bent
+    if abs(u) > 1e6:
+        return math.copysign(1.0, u), 0.0
+    whole = 1.0 + abs(u) ** power
+    root = whole ** (-1.0 / power)
+    return u * root, root / whole
+
+
+@njit(cache=True)
+def _slowed(v_free: float, lost: float, rise: float, power: float) -> float:
+    """Speed v with v + lost*risen(v/rise) = v_free: friction that rises with speed over one step, by Newton's method.
 
     Explicit steps would have to be as short as the mass takes to stop from the speed `rise`.
     """
     if rise <= 0.0:
         return v_free
     if lost <= 0.0:
-        return v_free - lost * math.tanh(v_free / rise)
+        return v_free - lost * _risen(v_free / rise, power)[0]
     low, high = min(v_free, 0.0), max(v_free, 0.0)
     slides = abs(v_free) > lost + rise
     v = v_free - math.copysign(lost, v_free) if slides else rise * math.atanh(0.999 * v_free / (lost + rise))
     v = min(max(v, low), high)
     for _ in range(20):
-        bent = math.tanh(v / rise)
-        error = v + lost * bent - v_free
+        share, steepness = _risen(v / rise, power)
+        error = v + lost * share - v_free
         if error > 0.0:
             high = v
         else:
             low = v
-        step = error / (1.0 + lost / rise * (1.0 - bent * bent))
+        step = error / (1.0 + lost / rise * steepness)
         if abs(step) <= 1e-9 * (abs(v) + rise):
             break
         v = v - step if low < v - step < high else 0.5 * (low + high)
@@ -243,8 +261,8 @@ def _slowed(v_free: float, lost: float, rise: float) -> float:
 @njit(cache=True)
 def _slowed_by_rising(v_free: float, load: float, h_over_m: float, p: Array) -> float:
     """Speed after the laws that rise with speed (`_rising`) have acted over one step, one after the other."""
-    v = _slowed(v_free, h_over_m * _smooth_level(v_free, p), p[SMOOTH_SPEED])
-    return _slowed(v, h_over_m * p[LOAD_SMOOTH] * abs(load - p[LOAD_ZERO]), p[LOAD_SMOOTH_SPEED])
+    v = _slowed(v_free, h_over_m * _smooth_level(v_free, p), p[SMOOTH_SPEED], p[SMOOTH_POWER])
+    return _slowed(v, h_over_m * p[LOAD_SMOOTH] * abs(load - p[LOAD_ZERO]), p[LOAD_SMOOTH_SPEED], 0.0)
 
 
 @njit(cache=True)

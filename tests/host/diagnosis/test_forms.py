@@ -138,8 +138,8 @@ def test_a_form_with_other_parameters_states_an_equation_of_its_own() -> None:
             assert name == "source" or name in names, (effect.id, effect.says)
 
 
-@pytest.mark.parametrize("rise", [0.05, 0.001])
-def test_friction_that_rises_with_speed_is_simulated_in_long_steps(rise: float) -> None:
+@pytest.mark.parametrize(("rise", "power"), [(0.05, 0.0), (0.001, 0.0), (0.05, 2.0), (0.001, 2.0), (0.01, 0.8)])
+def test_friction_that_rises_with_speed_is_simulated_in_long_steps(rise: float, power: float) -> None:
     """Against an adaptive integrator; an explicit step would have to be shorter than rise * mass / force, 1.7 ms."""
     t = 0.01 * np.arange(1500)
 
@@ -147,11 +147,12 @@ def test_friction_that_rises_with_speed_is_simulated_in_long_steps(rise: float) 
         return np.asarray(sum(np.sin(2.0 * np.pi * hertz * np.asarray(at) + k) for k, hertz in enumerate((0.21, 0.57, 1.3))))
 
     def slope(at: float, state: Array) -> list[float]:
-        pull = 3.0 * state[1] + 40.0 * state[0] + 0.3 * np.tanh(state[1] / rise)
-        return [state[1], (float(push(at)) - pull) / 0.5]
+        u = state[1] / rise
+        share = u / (1.0 + abs(u) ** power) ** (1.0 / power) if power else np.tanh(u)
+        return [state[1], (float(push(at)) - 3.0 * state[1] - 40.0 * state[0] - 0.3 * share) / 0.5]
 
     wanted = solve_ivp(slope, (0.0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-8, atol=1e-10, method="LSODA").y[0]
-    slots = {"smooth": 0.3, "smooth_speed": rise}
+    slots = {"smooth": 0.3, "smooth_speed": rise, "smooth_power": power}
     stages = push(t[:, None, None] + 0.005 * (np.arange(2)[None, :, None] + np.array([0.0, 0.5, 1.0])))
     law, none = np.array([0.5, 3.0, 40.0, 0.0]), np.zeros(t.size)
     run = run_axis(stages, 2, 0.01, law, slot_array([slots]), np.zeros(2), none, np.zeros(0), none[None], 0.0, 0.0)
