@@ -264,6 +264,7 @@ def _equals(
     kept: list[Candidate] = []
     refitted: list[tuple[Candidate, float]] = []
     rivals = _rivals(found, candidate, problem.rules)
+    same = set(replaced_by(less, candidate) or ())  # active effects of its family, next to which it is named
     names = [*dict.fromkeys(trial.candidate.name for trial in rivals)][: problem.rules.equals_fits]
     refits = 0
     for trial in rivals:
@@ -271,7 +272,8 @@ def _equals(
             break
         if trial.candidate.name not in names:
             continue
-        if replaced_by(less, trial.candidate) != ():
+        dropped = replaced_by(less, trial.candidate)
+        if dropped is None or not set(dropped) <= same:
             continue  # it stands for another active effect too: both together would say one thing twice
         if _elsewhere(trial.candidate, candidate):
             refitted.append((trial.candidate, 0.0))

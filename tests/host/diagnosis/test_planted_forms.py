@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from host.diagnosis import diagnose
+from host.studies.proof.worlds import case, suite
 from tests.host.proof.everyday import axis_nominal
 
 pytestmark = pytest.mark.slow
@@ -348,3 +350,12 @@ def test_a_mass_is_slowed_by_a_friction_that_falls_without_a_corner() -> None:
 
     (effect,) = diagnose([moving(seed) for seed in (1, 2, 3)], axis_nominal()).as_dict()["effects"]
     assert effect["id"] == "stribeck_friction"
+
+
+def test_a_friction_next_to_another_one_is_compared_with_its_own_rivals(tmp_path: Path) -> None:
+    """Stribeck and presliding friction (world `ode`, seed 538291): Coulomb friction had no equal (0.93)."""
+    case.write(case.make(suite.mechanisms("ode"), suite.plans("ode", 538291, 50)[40]), tmp_path)
+    result = diagnose(sorted(tmp_path.glob("*.csv")), tmp_path / "nominal.toml").as_dict()
+    coulomb, presliding = result["effects"]
+    assert (coulomb["id"], presliding["id"]) == ("coulomb_friction", "presliding_friction")
+    assert coulomb["indistinguishable_from"] == ["stribeck_friction@material"] and coulomb["probability"] < 0.9
