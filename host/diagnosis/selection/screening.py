@@ -517,8 +517,9 @@ def _absorbed(base: Base, terms: tuple[Term, ...], trial: Array, states: States)
     """All parameters fitted again from a shift in time at a grid point, and the residual then; None where they cannot be.
 
     Rates of the nominal model take most of a small delay. Next to one that is fitted they have to give it back first: a
-    change of the outputs at their present values says nothing then. The shift itself moves as well where that leaves less:
-    a delay of a part of a sample lies between the points of the grid.
+    change of the outputs at their present values says nothing then. Effects that are named already stay as they are where
+    that leaves less. So does the shift itself, or else it moves: a delay of a part of a sample lies between the points of
+    the grid.
     """
     problem, r = base.problem, _known(base, terms, trial)
     S = np.linalg.qr(states.responses.T - base.Q @ states.rates.T)[0]  # orthonormal, past all that is fitted
@@ -527,10 +528,11 @@ def _absorbed(base: Base, terms: tuple[Term, ...], trial: Array, states: States)
     J, aim = jacobian(problem, terms, trial, problem.stacked(terms, trial), sizes), r - S @ (S.T @ r)
     J -= S @ (S.T @ J)
     before = len(free(problem.parameters(terms[:-1])))
+    own = len(free(problem.parameters(())))  # of the nominal model alone: the corner of a limit follows no rate so far
     if not np.all(np.isfinite(J)):
         return None
     ends = []
-    for columns in (before, J.shape[1]):
+    for columns in dict.fromkeys((before, J.shape[1], own)):
         by = np.linalg.lstsq(J[:, :columns], aim, rcond=1e-10)[0]
         found = trial.copy()
         for index, step in zip(free(parameters), by, strict=False):

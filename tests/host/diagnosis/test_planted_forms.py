@@ -359,3 +359,16 @@ def test_a_friction_next_to_another_one_is_compared_with_its_own_rivals(tmp_path
     coulomb, presliding = result["effects"]
     assert (coulomb["id"], presliding["id"]) == ("coulomb_friction", "presliding_friction")
     assert coulomb["indistinguishable_from"] == ["stribeck_friction@material"] and coulomb["probability"] < 0.9
+
+
+def test_a_delay_is_found_past_a_limit_that_clips_the_same_reading(tmp_path: Path) -> None:
+    """A delay of 29 ms (world `mujoco`, seed 538291) was fitted as 5 ms past the limit, and named a resonance (0.93).
+
+    The rate of a limit holds only until the next sample reaches it. A step along it hid what the delay takes.
+    """
+    pytest.importorskip("mujoco")
+    case.write(case.make(suite.mechanisms("mujoco"), suite.plans("mujoco", 538291, 50)[47]), tmp_path)
+    result = diagnose(sorted(tmp_path.glob("*.csv")), tmp_path / "nominal.toml").as_dict()
+    assert [effect["id"] for effect in result["effects"]] == ["saturation", "latency"]
+    low, high = result["effects"][1]["parameters"]["delay_s"]["ci95"]
+    assert low <= 0.0286 <= high
