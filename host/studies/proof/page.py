@@ -1,6 +1,7 @@
 """Write the tables of the worlds to docs/proof.md: as the finder states its probabilities, and leaving one world out.
 
 python -m host.studies.proof.page --dir runs/prove_JUDGED --calibrate-on runs/prove_OTHER --docs docs/proof.md
+python -m host.studies.proof.page --dir runs/prove_JUDGED --together runs/prove_BEFORE     # and a table of both runs
 python -m host.studies.proof.page --dir runs/prove_JUDGED --world domains --docs docs/proof.md    # one world: a short table
 """
 
@@ -50,6 +51,22 @@ def block(run: Path, others: Sequence[Path]) -> str:
     ]
     parts += ["Cases that were not right:", _failures(run)]
     return "\n\n".join(parts)
+
+
+def together(runs: Sequence[Path]) -> str:
+    """Return one table of all cases of several runs, as the finder of each run states its probabilities."""
+    facts: dict[str, list[Facts]] = {}
+    seeds: dict[int, None] = {}
+    for run in runs:
+        note = json.loads((run / "suite.json").read_text(encoding="utf-8"))
+        seeds[note["seed"]] = None
+        for world in note["worlds"]:
+            facts.setdefault(world, []).extend(scored(run, world, as_stated))
+    counts = ", ".join(f"{len(found)} cases of {world}" for world, found in facts.items())
+    tables = {world: table.tabulate(found) for world, found in facts.items()}
+    title = f"Seeds {' and '.join(str(seed) for seed in seeds)} together, {counts}:"
+    reliable = table.reliability_markdown({world: table.reliability(found) for world, found in facts.items()})
+    return "\n\n".join((title, table.worlds_markdown(tables, OWN), "Stated probability against frequency:", reliable))
 
 
 def world_block(run: Path, world: str) -> str:
@@ -107,11 +124,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m host.studies.proof.page")
     parser.add_argument("--dir", type=Path, nargs="+", required=True, help="folders of judged runs, in this order")
     parser.add_argument("--calibrate-on", type=Path, action="append", default=[], help="folder of another finished run")
+    parser.add_argument("--together", type=Path, nargs="+", default=[], help="further runs: a table of all comes first")
     parser.add_argument("--world", help="only this world, in a short form between marks of its name")
     parser.add_argument("--docs", type=Path, help="page whose block is to be written; else it is printed")
     given = parser.parse_args(arguments)
     runs = given.dir
     text = "\n\n".join(world_block(run, given.world) if given.world else block(run, given.calibrate_on) for run in runs)
+    if given.together:
+        text = f"{together([*given.together, *runs])}\n\n{text}"
     if given.docs is None:
         print(text)
     else:

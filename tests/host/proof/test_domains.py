@@ -210,6 +210,8 @@ def test_the_page_lists_what_was_not_right(tmp_path: Path) -> None:
     text = page.world_block(tmp_path, "domains")
     assert "| null | 1 | 0 | 0 |" in text and "| single | 1 | 1 | 0 |" in text and "| all | 2 | 1 | 0 |" in text
     assert "| nothing, finding unit | 0.00 | nothing missing; findings: none |" in text and "ship_wheel" not in text
+    both = page.together([tmp_path, tmp_path])
+    assert f"Seeds {SEED} together, 4 cases of domains:" in both and "| cases with nothing planted | | 2 |" in both
     document = tmp_path / "page.md"
     document.write_text("<!-- worlds begin -->\nx\n<!-- worlds end -->\n<!-- domains begin -->\n<!-- domains end -->\n")
     page.main(["--dir", str(tmp_path), "--world", "domains", "--docs", str(document)])
