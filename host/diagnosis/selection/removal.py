@@ -16,7 +16,7 @@ from host.diagnosis.selection.folds import unexcited
 from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.refits import fit_nominal, fit_without, refined, restarted
 from host.diagnosis.selection.screening import term_of, without
-from host.diagnosis.selection.trial import Trial, at_bound, contained, richer_gain, same_place, vanished
+from host.diagnosis.selection.trial import Trial, at_bound, contained, richer_gain, same_place, sure_together, vanished
 
 
 def prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
@@ -137,8 +137,8 @@ def drop_unsure(problem: Problem, found: Found) -> None:
 
 
 def unsure(problem: Problem, fit: Fit) -> list[Term]:
-    """Terms whose amplitude these recordings do not determine: the interval of an effect of one parameter contains zero, or
-    that of the only amplitude reaches both of its bounds.
+    """Terms whose amplitude these recordings do not determine: the interval of an effect of one parameter contains zero, and
+    the other effects could do without it; or that of the only amplitude reaches both of its bounds.
 
     The latter is an effect that does what the nominal parameters do, such as a gain that changes where the motion ends.
     """
@@ -149,9 +149,27 @@ def unsure(problem: Problem, fit: Fit) -> list[Term]:
     spans, found = intervals(problem, fit), []
     for term, place in single:
         (low, high), p = spans[fit.first_of(term) + place], term.parameters[place]
-        if (low <= 0.0 <= high and len(term.parameters) == 1) or (low <= p.low and p.high <= high):
+        if low <= p.low and p.high <= high:
+            found.append(term)
+        elif low <= 0.0 <= high and len(term.parameters) == 1 and not _needed(problem, fit, term):
             found.append(term)
     return found
+
+
+def _needed(problem: Problem, fit: Fit, term: Term) -> bool:
+    """Whether all samples together, and those held out, are sure that `term` is needed next to the other effects.
+
+    Two effects that are much alike share an amplitude, whose interval is wide; without one of them the error may be far
+    larger all the same, in all parts of the recordings.
+    """
+    if len(fit.terms) == 1:
+        return False
+    begun = get_starts(problem)
+    less = fit_without(problem, fit, (term.candidate.key,), begin_again=True)
+    both = problem.gain("both", less.residuals, fit.residuals)
+    held = problem.gain("heldout", less.residuals, fit.residuals)
+    set_starts(problem, begun)
+    return sure_together(problem.rules, held, both, term.fitted)
 
 
 def drop_unsure_events(problem: Problem, found: Found, candidate_effects: list[Candidate]) -> None:
