@@ -27,7 +27,8 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Delay the signal (n,) by p[0] t, or by p[0] (t - p[1]); on a spline where it runs smoothly, which a line flattens."""
     late = p[0] * (c.time_s - p[1] if form == "set" else c.time_s)
     steps = np.diff(signal)
-    if np.max(np.abs(np.diff(steps)), initial=0.0) >= SMOOTH * np.max(np.abs(steps), initial=0.0):
+    bend, most = np.max(np.abs(np.diff(steps)), initial=0.0), np.max(np.abs(steps), initial=0.0)
+    if not bend < SMOOTH * most:  # nor where a part of a simulation gave no number
         return shift(signal, c.dt_s, late)
     return np.asarray(CubicSpline(c.time_s, signal)(np.clip(c.time_s - late, c.time_s[0], c.time_s[-1])))
 
