@@ -76,11 +76,16 @@ _DRY = Effect(
     remembers=True,
     dissipates=True,
 )
-_RISING = in_form(
-    _DRY,
-    "smooth",
-    "A force of up to {force} acts against the motion; below a speed of about {speed} it is smaller.",
-    "F = force*tanh(v/speed)",
+_RISING = replace(
+    in_form(
+        _DRY,
+        "smooth",
+        "A force of up to {force} acts against the motion; below a speed of about {speed} it is smaller.",
+        "F = force*tanh(v/speed)",
+    ),
+    timed=True,
+    remembers=False,
+    rounded=True,
 )
 EFFECTS = (
     Effect(
@@ -116,11 +121,6 @@ EFFECTS = (
         "A constant force of {force} acts against the motion; it builds up within {distance}, far below the travel.",
         "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
     ),
-    replace(_RISING, timed=True, remembers=False, rounded=True),
-    replace(
-        in_form(_RISING, "gradual", _RISING.says, "F = force*v/(speed^power + |v|^power)^(1/power)"),
-        timed=True,
-        remembers=False,
-        rounded=True,
-    ),
+    _RISING,
+    in_form(_RISING, "gradual", _RISING.says, "F = force*v/(speed^power + |v|^power)^(1/power)"),
 )

@@ -336,10 +336,8 @@ class SimulatedModel(Model):
             rows = []
             for row, name in zip(whole + self._payload(segment, active), self.section.outputs, strict=True):
                 moved = row + self._begin_of(segment).get(f"offset:{name}", 0.0) + self._force(segment, name, active)
-                if not np.isfinite(moved).any():  # the run failed: no effect has anything to read
-                    rows.append(moved)
-                    continue
-                rows.append(apply_effects(moved, active, f"{name}_reading", segment, None))
+                ran = np.isfinite(moved).any()  # of a run that failed no effect has anything to read
+                rows.append(apply_effects(moved, active, f"{name}_reading", segment, None) if ran else moved)
             out.append(np.vstack(rows))
         return out
 

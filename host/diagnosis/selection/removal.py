@@ -26,9 +26,7 @@ def prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
         dropped = False
         for term in best.terms:
             begun = get_starts(problem)
-            less = fit_without(problem, best, (term.candidate.key,), begin_again=True)
-            gain = problem.gain("both", less.residuals, best.residuals)
-            held = problem.gain("heldout", less.residuals, best.residuals)
+            less, gain, held = _gained(problem, best, term)
             least = max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
             price = rules.parameter_penalty * term.fitted
             few = gain.log_likelihood < rules.heldout_log_likelihood + price
@@ -42,6 +40,13 @@ def prune(problem: Problem, best: Fit, steps: list[Step]) -> Fit:
                 break
             set_starts(problem, begun)
     return best
+
+
+def _gained(problem: Problem, fit: Fit, term: Term) -> tuple[Fit, Gain, Gain]:
+    """`fit` without `term`, with the memories begun again, and what `term` gains on all samples and on those held out."""
+    less = fit_without(problem, fit, (term.candidate.key,), begin_again=True)
+    both, held = (problem.gain(which, less.residuals, fit.residuals) for which in ("both", "heldout"))
+    return less, both, held
 
 
 def reduce(problem: Problem, found: Found) -> None:
@@ -165,9 +170,7 @@ def _needed(problem: Problem, fit: Fit, term: Term) -> bool:
     if len(fit.terms) == 1:
         return False
     begun = get_starts(problem)
-    less = fit_without(problem, fit, (term.candidate.key,), begin_again=True)
-    both = problem.gain("both", less.residuals, fit.residuals)
-    held = problem.gain("heldout", less.residuals, fit.residuals)
+    _, both, held = _gained(problem, fit, term)
     set_starts(problem, begun)
     return sure_together(problem.rules, held, both, term.fitted)
 

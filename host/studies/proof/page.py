@@ -45,28 +45,26 @@ def block(run: Path, others: Sequence[Path]) -> str:
             f"Leaving one world out: each world with probabilities calibrated on the other worlds of seed {seeds}:",
             table.worlds_markdown({w: table.tabulate(f) for w, f in used.items()}, OWN),
         ]
-    parts += [
-        "Stated probability against frequency:",
-        table.reliability_markdown({w: table.reliability(f) for w, f in used.items()}),
-    ]
-    parts += ["Cases that were not right:", _failures(run)]
+    parts += [_reliability(used), "Cases that were not right:", _failures(run)]
     return "\n\n".join(parts)
+
+
+def _reliability(facts: dict[str, list[Facts]]) -> str:
+    shares = table.reliability_markdown({world: table.reliability(found) for world, found in facts.items()})
+    return f"Stated probability against frequency:\n\n{shares}"
 
 
 def together(runs: Sequence[Path]) -> str:
     """Return one table of all cases of several runs, as the finder of each run states its probabilities."""
     facts: dict[str, list[Facts]] = {}
-    seeds: dict[int, None] = {}
-    for run in runs:
-        note = json.loads((run / "suite.json").read_text(encoding="utf-8"))
-        seeds[note["seed"]] = None
+    notes = [json.loads((run / "suite.json").read_text(encoding="utf-8")) for run in runs]
+    for run, note in zip(runs, notes, strict=True):
         for world in note["worlds"]:
             facts.setdefault(world, []).extend(scored(run, world, as_stated))
     counts = ", ".join(f"{len(found)} cases of {world}" for world, found in facts.items())
     tables = {world: table.tabulate(found) for world, found in facts.items()}
-    title = f"Seeds {' and '.join(str(seed) for seed in seeds)} together, {counts}:"
-    reliable = table.reliability_markdown({world: table.reliability(found) for world, found in facts.items()})
-    return "\n\n".join((title, table.worlds_markdown(tables, OWN), "Stated probability against frequency:", reliable))
+    title = f"Seeds {' and '.join(dict.fromkeys(str(note['seed']) for note in notes))} together, {counts}:"
+    return "\n\n".join((title, table.worlds_markdown(tables, OWN), _reliability(facts)))
 
 
 def world_block(run: Path, world: str) -> str:

@@ -14,8 +14,8 @@ from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.locate import windows
-from host.studies.proof.worlds import case, suite
 from tests.host.proof.everyday import free_nominal
+from tests.host.proof.suite_cases import verdict_of
 
 RATE_HZ = 400.0
 STIFFNESS, DAMPING = 150.0, 2.0
@@ -187,6 +187,5 @@ def test_windows_of_a_recording_shorter_than_their_average() -> None:
 
 def test_a_loop_in_which_nothing_is_missing_has_no_mode(tmp_path: Path) -> None:
     """A null of the proof (world `ode`, seed 352917) of which a load of 45 times the drive's mass took noise away."""
-    case.write(case.make(suite.mechanisms("ode"), suite.plans("ode", 352917, 50)[5]), tmp_path)
-    result = diagnose(sorted(tmp_path.glob("*.csv")), tmp_path / "nominal.toml").as_dict()
+    result = verdict_of("ode", 352917, 5, tmp_path)
     assert result["verdict"] == "nothing_missing" and result["effects"] == []

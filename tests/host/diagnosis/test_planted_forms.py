@@ -11,8 +11,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from host.diagnosis import diagnose
-from host.studies.proof.worlds import case, suite
 from tests.host.proof.everyday import axis_nominal
+from tests.host.proof.suite_cases import verdict_of
 
 pytestmark = pytest.mark.slow
 Array = np.ndarray
@@ -354,8 +354,7 @@ def test_a_mass_is_slowed_by_a_friction_that_falls_without_a_corner() -> None:
 
 def test_a_friction_next_to_another_one_is_compared_with_its_own_rivals(tmp_path: Path) -> None:
     """Stribeck and presliding friction (world `ode`, seed 538291): Coulomb friction had no equal (0.93)."""
-    case.write(case.make(suite.mechanisms("ode"), suite.plans("ode", 538291, 50)[40]), tmp_path)
-    result = diagnose(sorted(tmp_path.glob("*.csv")), tmp_path / "nominal.toml").as_dict()
+    result = verdict_of("ode", 538291, 40, tmp_path)
     coulomb, presliding = result["effects"]
     assert (coulomb["id"], presliding["id"]) == ("coulomb_friction", "presliding_friction")
     assert coulomb["indistinguishable_from"] == ["stribeck_friction@material"] and coulomb["probability"] < 0.9
@@ -367,8 +366,7 @@ def test_a_delay_is_found_past_a_limit_that_clips_the_same_reading(tmp_path: Pat
     The rate of a limit holds only until the next sample reaches it. A step along it hid what the delay takes.
     """
     pytest.importorskip("mujoco")
-    case.write(case.make(suite.mechanisms("mujoco"), suite.plans("mujoco", 538291, 50)[47]), tmp_path)
-    result = diagnose(sorted(tmp_path.glob("*.csv")), tmp_path / "nominal.toml").as_dict()
+    result = verdict_of("mujoco", 538291, 47, tmp_path)
     assert [effect["id"] for effect in result["effects"]] == ["saturation", "latency"]
     low, high = result["effects"][1]["parameters"]["delay_s"]["ci95"]
     assert low <= 0.0286 <= high
@@ -379,6 +377,5 @@ def test_two_effects_that_share_an_amplitude_are_both_needed(tmp_path: Path) -> 
 
     Without the drift the squared error is larger by 415 of log-likelihood.
     """
-    case.write(case.make(suite.mechanisms("ode"), suite.plans("ode", 538291, 50)[19]), tmp_path)
-    result = diagnose(sorted(tmp_path.glob("*.csv")), tmp_path / "nominal.toml").as_dict()
+    result = verdict_of("ode", 538291, 19, tmp_path)
     assert {effect["id"] for effect in result["effects"]} == {"sensor_drift", "creep_relaxation"}
