@@ -453,7 +453,7 @@ def _past_sampling(
     """
     late = within_sample(begun.found.last_trials, begun.found.best)
     if late is None:
-        return begun
+        return _with_delay_first(spec, begun, recordings, candidate_effects, progress)
     if not begun.problem.budget.spent():
         past = _past_delay(spec, late, begun, recordings, candidate_effects, progress)
         if past is not None:
@@ -461,6 +461,33 @@ def _past_sampling(
     if begun.found.best.terms:
         return begun
     return replace(begun, findings=[*begun.findings, *late_by_a_sample(begun.problem, late)])
+
+
+def _with_delay_first(
+    spec: NominalSpec,
+    begun: _Searched,
+    recordings: list[Recording],
+    candidate_effects: Sequence[Candidate],
+    progress: Progress,
+) -> _Searched:
+    """What a search finds past a delay within one sample that alone did nearly as well as the first effect, if likelier.
+
+    An effect can stand in for such a delay together with what else is missing. Once it is named, nothing calls for the
+    delay any more.
+    """
+    found, rules = begun.found, begun.problem.rules
+    first = found.steps[0] if found.best.terms and found.steps else None
+    late = within_sample(first.trials, found.nominal) if first is not None else None
+    if first is None or late is None or begun.problem.budget.spent():
+        return begun
+    if late.score < rules.alternative_start_score * first.trials[0].score:
+        return begun
+    past = _past_delay(spec, late, begun, recordings, candidate_effects, progress)
+    if past is None:
+        return begun
+    ahead = begun.problem.gain("both", found.best.residuals, past.found.best.residuals).log_likelihood
+    more = past.found.best.fitted + late.fit.fitted - found.best.fitted  # the delay is a parameter, too
+    return past if ahead > rules.heldout_log_likelihood + rules.parameter_penalty * more else begun
 
 
 def _past_delay(

@@ -379,3 +379,13 @@ def test_two_effects_that_share_an_amplitude_are_both_needed(tmp_path: Path) -> 
     """
     result = verdict_of("ode", 538291, 19, tmp_path)
     assert {effect["id"] for effect in result["effects"]} == {"sensor_drift", "creep_relaxation"}
+
+
+def test_no_mode_stands_in_for_a_delay_within_a_sample_and_a_slow_creep(tmp_path: Path) -> None:
+    """A delay of 7.6 ms at a period of 16.6 ms and a creep of 2.2 s (world `ode`, seed 538291): a creep of 0.15 s entered
+    first, and a mode of 0.13 Hz was named next to it (0.92).
+    """
+    result = verdict_of("ode", 538291, 49, tmp_path)
+    (effect,) = result["effects"]
+    assert effect["id"] == "creep_relaxation" and 1.0 < effect["parameters"]["time_constant_s"]["value"] < 3.0
+    assert "within_sample" in {finding["id"] for finding in result["data_findings"]}
