@@ -18,6 +18,7 @@ CONFIDENT = 0.9  # stated probability from which on a name is a confident one
 SILENT_BELOW = 0.19  # rho under which nothing is promised: `nothing_missing` is not a fault there
 FROM_THE_BEGIN = {"clock_drift"}
 BEHIND = "behind the gain"  # in the equation of an effect that acts on the output of its link
+LOWER = "max(x, limit)"  # in the equation of a limit at the lower side alone, which is minus the planted one of both sides
 _UNITS = {"m", "rad", "N", "Nm", "s", "Hz", "per", "m2", "m3", "N2", "s2", "square", "share", "kg"}
 
 
@@ -251,12 +252,13 @@ def parameters(label: Label, effects: list[dict[str, Any]]) -> tuple[tuple[float
 def comparable(planted: PlantedTruth, effect: dict[str, Any]) -> dict[str, float]:
     """True values that the parameters of `effect` can be held against, by name, as the label or its equivalents have them.
 
-    An amplitude that the effect counts behind the gain is turned there; a drift that began later than the recordings is
-    none whose rate counts from their begin.
+    An amplitude that the effect counts behind the gain is turned there, and a limit that acts at the lower side alone is
+    below zero; a drift that began later than the recordings is none whose rate counts from their begin.
     """
     if planted["id"] in FROM_THE_BEGIN and planted["start_s"] > 0.0:
         return {}
-    gain = planted.get("gain", 1.0) if BEHIND in str(effect.get("equation", "")) else 1.0
+    equation = str(effect.get("equation", ""))
+    gain = planted.get("gain", 1.0) if BEHIND in equation else -1.0 if LOWER in equation else 1.0
     return {name: gain * float(planted["parameters"][name]) for name in planted["compared"]} | planted.get("equivalent", {})
 
 

@@ -157,6 +157,9 @@ def test_values_are_compared_in_the_words_that_the_finder_has_for_them() -> None
     assert held(whip, "y + amplitude*sin(y + phase) = x, behind the gain", amplitude_rad=0.2) == (False,)
     scale = {"id": "sensor_scale", "parameters": {"gain": 1.1}, "compared": [], "equivalent": {"gain_error": 0.1}}
     assert held(scale, "", gain_error=0.1) == (True,)
+    limit = {"id": "saturation", "parameters": {"limit_N": 0.2}, "compared": ["limit_N"], "gain": 1.0}
+    assert held(limit, "y = max(x, limit)", limit_N=-0.2) == (True,)
+    assert held(limit, "y = min(x, limit)", limit_N=-0.2) == (False,)
 
 
 def test_a_drift_that_begins_late_has_no_rate_since_the_begin() -> None:
