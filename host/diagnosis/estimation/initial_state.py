@@ -169,6 +169,15 @@ def _answers(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: 
     return np.where(seen, r, 0.0), np.array(columns).reshape(-1, r.size).T, states
 
 
+def answers_to_memories(problem: Problem, segment: Segment, fit: Fit) -> Array:
+    """Change (samples, k) of the weighted simulation of a recording per standard deviation of each memory at its begin.
+
+    samples: those to fit, one output after the other.
+    """
+    _, columns, states = _answers(problem, segment, fit, fit.values, segment.fit)
+    return columns[:, [k for k, state in enumerate(states) if state.key]]
+
+
 def fit_with_states(problem: Problem, fit: Fit, steps: int) -> Fit:
     """`fit` after Gauss-Newton steps of all its parameters and the states of the recordings to fit, together.
 

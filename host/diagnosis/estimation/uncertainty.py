@@ -12,6 +12,7 @@ from scipy import stats
 
 from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, answers_to_begin, free, jacobian, size_of
+from host.diagnosis.estimation.initial_state import answers_to_memories
 from host.diagnosis.estimation.instants import instant_interval
 from host.diagnosis.model.effect import Parameter
 from host.diagnosis.model.findings import Finding
@@ -49,9 +50,10 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     scores = _coloured(problem, J, base) + _level(base) * np.diag(np.concatenate((bounds, np.zeros(known.size))))
     even = np.sqrt(np.maximum(np.diag(inverse @ scores @ inverse), 0.0))
     spread, freedom = _jackknife(_blocks(problem, J, base), prior)
-    fine = np.maximum(quantile * even, stats.t.ppf(0.5 + 0.5 * level, freedom) * spread)
+    own = slice(0, rates.shape[1])
+    fine = np.maximum(quantile * even, stats.t.ppf(0.5 + 0.5 * level, freedom) * spread)[own]
     coarse, count = _across_recordings(problem, fit, sizes, inverse)
-    by_chance = stats.f.ppf(problem.rules.scatter_probability, count - 1, np.maximum(freedom, 2.0))
+    by_chance = stats.f.ppf(problem.rules.scatter_probability, count - 1, np.maximum(freedom[own], 2.0))
     scattered = coarse > by_chance * (fine / quantile) ** 2
     wide = float(stats.t.ppf(0.5 + 0.5 * level, count - 1)) * np.sqrt(np.maximum(coarse, 0.0))
     widths = np.where(scattered, np.maximum(wide, fine), fine)
@@ -145,11 +147,16 @@ def _inverse(A: Array) -> Array:
 
 
 def _across_recordings(problem: Problem, fit: Fit, sizes: list[float], inverse: Array) -> tuple[Array, int]:
-    """Variances from the scatter of scores between halves of recordings, fitted and held-out ones alike; their number."""
+    """Variances from the scatter of scores between halves of recordings, fitted and held-out ones alike; their number.
+
+    The states that each recording begins with are fitted to it. Scores are those of what the parameters change past them
+    (Frisch and Waugh 1933).
+    """
     both = replace(problem, segments=[replace(segment, fit=segment.fit | segment.heldout) for segment in problem.segments])
     base = both.stacked(fit.terms, fit.values)
     J = jacobian(both, fit.terms, fit.values, base, sizes)
-    J = np.column_stack([J, np.zeros((base.size, inverse.shape[0] - J.shape[1]))])
+    by_begin, known = _by_begin(both, fit, base)
+    J = J - by_begin @ (_inverse(by_begin.T @ by_begin + np.diag(known)) @ (by_begin.T @ J))
     scores, at, rows = [], 0, len(problem.model.outputs)
     for segment, given in zip(both.segments, problem.segments, strict=True):
         n = int(segment.fit.sum())
@@ -160,28 +167,37 @@ def _across_recordings(problem: Problem, fit: Fit, sizes: list[float], inverse: 
             scores += [half.sum(axis=0) for half in np.array_split(products[mask], 2) if half.size]
     S, count = np.array(scores), len(scores)
     share = sum(p.fit.sum() for p in problem.segments) / max(sum(p.fit.sum() for p in both.segments), 1)
-    covariance = inverse @ (S.T @ S * (share * count / max(count - 1, 1))) @ inverse
+    of_parameters = inverse[: J.shape[1], : J.shape[1]]
+    covariance = of_parameters @ (S.T @ S * (share * count / max(count - 1, 1))) @ of_parameters
     return np.diag(covariance), max(count, 2)
 
 
 def _by_begin(problem: Problem, fit: Fit, base: Array) -> tuple[Array, Array]:
-    """Rates of the weighted simulation by the state from which each recording runs freely, where a model has one, because
-    it is estimated too; and how well each state is known beforehand.
+    """Rates of the weighted simulation by the state from which each recording runs freely, where a model has one, and by the
+    memory with which each effect begins there, because both are estimated too; and how well each is known beforehand.
 
-    Columns are for one standard deviation of the measured state. Its precision in the units of the residuals is their
-    level, counted by correlation time: without it, a block that holds the begin of a recording would leave that state
-    free when it is left out.
+    Without its memories, the frequency of a line would be as certain as if the phase of each recording were known: half its
+    interval. Columns are for one standard deviation of what is known of a state. Its precision in the units of the
+    residuals is their level, counted by correlation time: without it, a block that holds the begin of a recording would
+    leave that state free when it is left out.
     """
     columns, known, at, rows = [], [], 0, len(problem.model.outputs)
     for segment in problem.segments:
         n = rows * int(segment.fit.sum())
-        part, at = base[at : at + n].reshape(rows, -1), at + n
-        begin = segment.begin
-        if n and begin is not None:
-            level = float(np.mean([np.mean(row**2) * correlation_time(row) for row in part]))
-            for _, column in answers_to_begin(problem, fit.terms, fit.values, base, begin):
-                columns.append(column)
-                known.append(level)
+        part, at = slice(at, at + n), at + n
+        if not n:
+            continue
+        begin, memories = segment.begin, answers_to_memories(problem, segment, fit)
+        own = (
+            [] if begin is None else [column for _, column in answers_to_begin(problem, fit.terms, fit.values, base, begin)]
+        )
+        for change in memories.T:
+            column = np.zeros(base.size)
+            column[part] = change
+            own.append(column)
+        level = float(np.mean([np.mean(row**2) * correlation_time(row) for row in base[part].reshape(rows, -1)]))
+        columns += own
+        known += [level] * len(own)
     used = [k for k, column in enumerate(columns) if np.any(column)]
     if not used:
         return np.zeros((base.size, 0)), np.zeros(0)

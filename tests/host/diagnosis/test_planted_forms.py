@@ -389,3 +389,18 @@ def test_no_mode_stands_in_for_a_delay_within_a_sample_and_a_slow_creep(tmp_path
     (effect,) = result["effects"]
     assert effect["id"] == "creep_relaxation" and 1.0 < effect["parameters"]["time_constant_s"]["value"] < 3.0
     assert "within_sample" in {finding["id"] for finding in result["data_findings"]}
+
+
+def test_the_frequency_of_a_line_is_as_uncertain_as_unknown_phases_leave_it() -> None:
+    """Rife and Boorstyn 1974: sqrt(6)*sd/(pi*amplitude*T*sqrt(n)) at best, for n samples in T seconds; twice as much as with
+    known phases.
+    """
+
+    def humming(t: Array, x: Array, normal: Array) -> Array:
+        return np.asarray(0.03 * np.sin(2.0 * np.pi * 2.3 * t + 40.0 * normal[0]))
+
+    (effect,) = diagnose([pressed(seed, 8.0, humming) for seed in (1, 2, 3)], PRESSED).as_dict()["effects"]
+    assert (effect["id"], effect["equation"].count("of each recording")) == ("periodic_disturbance", 1)
+    low, high = effect["parameters"]["frequency_Hz"]["ci95"]
+    best_Hz = np.sqrt(6.0) * 0.02 / (np.pi * 0.03 * 8.0 * np.sqrt(2 * 8000))  # two recordings are fitted
+    assert low < 2.3 < high and 0.9 * 1.96 * best_Hz < 0.5 * (high - low) < 1.6 * 1.96 * best_Hz
