@@ -128,6 +128,10 @@ class Model(ABC):
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """The displacement or force (n,) that `port` would need to explain `residual` (outputs, n)."""
 
+    def passive(self, theta: Array, active: list[ActiveEffect]) -> bool:
+        """Whether no part of the law, the active effects included, is a mass, damper or spring below zero."""
+        return True
+
     def guess(self, segments: list[Segment]) -> Array:
         """Start values of the nominal parameters: those of the TOML."""
         return np.array([p.grid[0] for p in self.parameters])

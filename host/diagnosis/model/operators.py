@@ -416,7 +416,7 @@ def least_error_window(x: Array, dt_s: float, sigma: float, degree: int, order: 
     signal = np.where(power > least, power - noise, 0.0) * 2.0 / (x.size * float(taper @ taper))
     exact = (2j * np.pi * np.fft.rfftfreq(x.size, dt_s)) ** order
     errors = {}
-    for half in np.unique(np.geomspace((degree + 2) // 2 + 1, max(x.size // 16, degree), 24).astype(int)):
+    for half in np.unique(np.geomspace((degree + 2) // 2, max(x.size // 16, degree), 24).astype(int)):
         window = 2 * int(half) + 1
         h = savgol_coeffs(window, degree, deriv=order, delta=dt_s, use="dot")
         passed = np.fft.rfft(np.roll(np.pad(h, (0, max(x.size - window, 0))), -int(half)))[: exact.size]

@@ -25,6 +25,7 @@ from host.diagnosis.models.moved import Moved, force_along
 
 Array = npt.NDArray[np.float64]
 
+NEGLIGIBLE = 0.1  # of a second mass: what an inexact acceleration can leave of a mass that is not there
 NOWHERE = Moved(np.zeros(0), np.zeros(0), np.zeros(0), 0.0)
 
 
@@ -138,6 +139,17 @@ class ImpedanceModel(Model):
             segment.inputs[f"{port}_spring"] = stiffness * moved.x
         force = force + force_along(moved, here, segment, port, float(stiffness))
         return np.asarray(apply_effects(force, active, f"{self.spec.subsystem}_reading", segment, None))[None, :]
+
+    def passive(self, theta: Array, active: list[ActiveEffect]) -> bool:
+        """Whether the mass is not below zero next to a second one on a spring.
+
+        The two together would have a smaller mass at low frequencies than at high ones. That makes up for what differences
+        of a sampled motion lack, and takes noise of the motion out of the force.
+        """
+        mass = sum(float(value) for (term, _), value in zip(self.terms, theta, strict=True) if term == "mass")
+        slots = [c.effect.slots(values, c.form) for c, values in active if c.effect.slots is not None]
+        second = sum(own.get("second_mass", 0.0) for own in slots)
+        return mass >= -NEGLIGIBLE * second
 
     def _handed_on(self, segment: MovedSegment, active: list[ActiveEffect]) -> Moved:
         """The motion behind the effects between where it is measured and where the force acts."""

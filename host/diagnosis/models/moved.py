@@ -17,7 +17,7 @@ from host.diagnosis.model.operators import least_error_window, smooth_derivative
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.03
 DEGREE = 5  # of the local polynomial that is differentiated,
-WIDER = 1.45  # and its window over that of a cubic that passes as much noise
+WIDER = 1.45  # and its widest window over that of a cubic that passes as much noise
 SHORTEST = 200  # samples of a motion whose spectrum says how far it may be smoothed
 CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
 
@@ -46,7 +46,7 @@ class Moved:
         clean = noise < CLEAN * tolerance
         windows = [window] * 3
         if not clean:  # each derivative with the window of its own least error, no wider than the band allows
-            widest, least = round(WIDER * window) | 1, round(WIDER * 7) | 1
+            widest, least = round(WIDER * window) | 1, DEGREE + 2
             best = [widest] * 3
             if recording.timed and motion.size >= SHORTEST:
                 best = [least_error_window(motion, recording.dt_s, noise, DEGREE, order) for order in (0, 1, 2)]

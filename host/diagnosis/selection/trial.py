@@ -33,6 +33,7 @@ class Trial:
     apart: bool = True  # whether whole recordings are held out, not blocks between the fitted ones
     seldom: bool = False  # whether a sensor is read more seldom than it is logged
     cancelled: float = 0.0  # share of the residual's variance that is noise which the effect could cancel
+    passive: bool = True  # whether no mass, damper or spring of the law is below zero
     crossed: Gain | None = None  # of all recordings, each predicted from the others, where those held out show nothing
 
 
@@ -251,7 +252,7 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     samples together have to be surer by far. Blocks held out between the fitted ones have the same excitation: no excuse.
     """
     gone = vanished(trial.fit, trial.fit.terms[-1], trial.rules)
-    return not gone and not at_bound(trial.fit) and not of_sampling(trial) and called_for(trial, base)
+    return trial.passive and not gone and not at_bound(trial.fit) and not of_sampling(trial) and called_for(trial, base)
 
 
 def called_for(trial: Trial, base: Fit) -> bool:

@@ -404,3 +404,24 @@ def test_the_frequency_of_a_line_is_as_uncertain_as_unknown_phases_leave_it() ->
     low, high = effect["parameters"]["frequency_Hz"]["ci95"]
     best_Hz = np.sqrt(6.0) * 0.02 / (np.pi * 0.03 * 8.0 * np.sqrt(2 * 8000))  # two recordings are fitted
     assert low < 2.3 < high and 0.9 * 1.96 * best_Hz < 0.5 * (high - low) < 1.6 * 1.96 * best_Hz
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 2e-6])
+def test_no_second_mass_makes_up_for_what_differences_of_a_motion_lack(noise_m: float) -> None:
+    """Motion of up to 25 Hz, read at 100 Hz: a mass of 5 g with one of 43 g on a spring was named a resonance (0.94)."""
+
+    def moving(seed: int) -> dict[str, Array]:
+        t, rng = np.arange(0.0, 30.0, 0.01), np.random.default_rng(seed)
+        f = np.concatenate((rng.uniform(0.2, 2.0, 4), rng.uniform(10.0, 25.0, 6)))
+        size, w = np.where(f < 5.0, 2e-3, 8e-4 / f)[:, None], 2.0 * np.pi * f[:, None]
+        phase = w * t + rng.uniform(0.0, 2.0 * np.pi, (f.size, 1))
+        x, v, a = (np.sum(size * each, axis=0) for each in (np.sin(phase), w * np.cos(phase), -w * w * np.sin(phase)))
+        force = 0.05 * a + 3.0 * v + 220.0 * x + 0.1 * rng.normal(size=t.size)
+        return {"t": t, "x": x + noise_m * rng.normal(size=t.size), "f": force, "n": np.zeros(t.size)}
+
+    nominal = PRESSED | {"impedance": PRESSED["impedance"] | {"terms": ["mass", "damping", "stiffness", "offset"]}}
+    nominal["impedance"].pop("others")
+    nominal["channels"] = {name: channel for name, channel in PRESSED["channels"].items() if name != "normal"}
+    result = diagnose([moving(seed) for seed in (1, 2, 3)], nominal).as_dict()
+    assert result["verdict"] == "nothing_missing"
+    assert result["fit"]["nominal_parameters"]["mass_N_s2_per_m"]["value"] == pytest.approx(0.05, rel=0.15)
