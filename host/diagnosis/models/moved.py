@@ -18,6 +18,7 @@ Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.03
 DEGREE = 5  # of the local polynomial that is differentiated,
 WIDER = 1.45  # and its widest window over that of a cubic that passes as much noise
+LEAST_WINDOW = 11  # samples of the shortest window of position and speed, whose noise would hide where a motion reverses
 SHORTEST = 200  # samples of a motion whose spectrum says how far it may be smoothed
 CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
 
@@ -46,11 +47,11 @@ class Moved:
         clean = noise < CLEAN * tolerance
         windows = [window] * 3
         if not clean:  # each derivative with the window of its own least error, no wider than the band allows
-            widest, least = round(WIDER * window) | 1, DEGREE + 2
+            widest, least = round(WIDER * window) | 1, (LEAST_WINDOW, LEAST_WINDOW, DEGREE + 2)
             best = [widest] * 3
             if recording.timed and motion.size >= SHORTEST:
                 best = [least_error_window(motion, recording.dt_s, noise, DEGREE, order) for order in (0, 1, 2)]
-            windows = [max(min(one, widest), least) for one in best]
+            windows = [max(min(one, widest), short) for one, short in zip(best, least, strict=True)]
         x, v, a = (smooth_derivatives(motion, recording.dt_s, one, DEGREE)[k] for k, one in enumerate(windows))
         # smoothing a clean motion would round its reversals, and friction with them
         taken = (1 if clean else windows[0], windows[1], windows[2])
