@@ -426,7 +426,7 @@ def _searched(
         return None
     found = concluded(problem, found, candidate_effects, progress)
     begun = _Searched(model, problem, full, found, [*apart, *frozen, *lone, *held])
-    return _past_sampling(spec, begun, recordings, candidate_effects, overall.part(later, high))
+    return _past_sampling(_Again(spec, recordings, candidate_effects, overall.part(later, high)), begun)
 
 
 @dataclass(frozen=True)
@@ -440,22 +440,26 @@ class _Searched:
     findings: list[Finding]  # what was found about the data on the way
 
 
-def _past_sampling(
-    spec: NominalSpec,
-    begun: _Searched,
-    recordings: list[Recording],
-    candidate_effects: Sequence[Candidate],
-    progress: Progress,
-) -> _Searched:
+@dataclass(frozen=True)
+class _Again:
+    """What a second search starts from: the nominal model and recordings of the first one, its effects, its progress."""
+
+    spec: NominalSpec
+    recordings: list[Recording]
+    candidates: list[Candidate]
+    progress: Progress
+
+
+def _past_sampling(again: _Again, begun: _Searched) -> _Searched:
     """What a second search finds, with a delay within one sample among the nominal parameters, where the data call for one.
 
     Such a delay is not named, because it may be a matter of the recording. It still hides what else is missing.
     """
     late = within_sample(begun.found.last_trials, begun.found.best)
     if late is None:
-        return _with_delay_first(spec, begun, recordings, candidate_effects, progress)
+        return _with_delay_first(again, begun)
     if not begun.problem.budget.spent():
-        past = _past_delay(spec, late, begun, recordings, candidate_effects, progress)
+        past = _past_delay(again, late, begun)
         if past is not None:
             return past
     if begun.found.best.terms:
@@ -463,13 +467,7 @@ def _past_sampling(
     return replace(begun, findings=[*begun.findings, *late_by_a_sample(begun.problem, late)])
 
 
-def _with_delay_first(
-    spec: NominalSpec,
-    begun: _Searched,
-    recordings: list[Recording],
-    candidate_effects: Sequence[Candidate],
-    progress: Progress,
-) -> _Searched:
+def _with_delay_first(again: _Again, begun: _Searched) -> _Searched:
     """What a search finds past a delay within one sample that alone did nearly as well as the first effect, if likelier.
 
     An effect can stand in for such a delay together with what else is missing. Once it is named, nothing calls for the
@@ -482,7 +480,7 @@ def _with_delay_first(
         return begun
     if late.score < rules.alternative_start_score * first.trials[0].score:
         return begun
-    past = _past_delay(spec, late, begun, recordings, candidate_effects, progress)
+    past = _past_delay(again, late, begun)
     if past is None:
         return begun
     ahead = begun.problem.gain("both", found.best.residuals, past.found.best.residuals).log_likelihood
@@ -490,14 +488,7 @@ def _with_delay_first(
     return past if ahead > rules.heldout_log_likelihood + rules.parameter_penalty * more else begun
 
 
-def _past_delay(
-    spec: NominalSpec,
-    late: Trial,
-    begun: _Searched,
-    recordings: list[Recording],
-    candidate_effects: Sequence[Candidate],
-    progress: Progress,
-) -> _Searched | None:
+def _past_delay(again: _Again, late: Trial, begun: _Searched) -> _Searched | None:
     """The search with the delay of `late` among the nominal parameters; None if that names nothing better.
 
     What is named may be no shape of the delay: its gain has to be that of a further effect, it is not a linear effect at the
@@ -508,12 +499,13 @@ def _past_delay(
     known = EffectSpec(
         id=candidate.effect.id, at=candidate.port.name, values=values, source=candidate.source, form=candidate.form
     )
-    model, again, full = problems(spec.model_copy(update={"effect": [*spec.effect, known]}), recordings, problem.rules)
-    again.budget, again.joint_states = problem.budget, problem.joint_states
-    for each in (again, full):
+    extended = again.spec.model_copy(update={"effect": [*again.spec.effect, known]})
+    model, second, full = problems(extended, again.recordings, problem.rules)
+    second.budget, second.joint_states = problem.budget, problem.joint_states
+    for each in (second, full):
         model.hold_as(each.segments, problem.model.hold)
-    others = [c for c in candidate_effects if not (c.effect.shifts and c.port.held)]
-    found = search(again, others, progress, late.both.log_likelihood)
+    others = [c for c in again.candidates if not (c.effect.shifts and c.port.held)]
+    found = search(second, others, again.progress, late.both.log_likelihood)
     place = {*candidate.port.path, candidate.port.name}
     own = [t for t in found.best.terms if not (t.candidate.effect.invariant and t.candidate.port.name in place)]
     delay_s = found.best.values[len(problem.model.parameters) : len(model.parameters)]
@@ -524,7 +516,7 @@ def _past_delay(
     earned = problem.gain("both", begun.found.nominal.residuals, before).log_likelihood
     if ahead < -max(rules.heldout_log_likelihood, rules.refinement_tolerance * earned):
         return None
-    return _Searched(model, again, full, found, [*begun.findings, *late_by_a_sample(again, late, past=True)])
+    return _Searched(model, second, full, found, [*begun.findings, *late_by_a_sample(second, late, past=True)])
 
 
 def _without_frozen(

@@ -136,6 +136,10 @@ class Problem:
             at += len(term.parameters)
         return nominal, active
 
+    def passive(self, fit: Fit) -> bool:
+        """Whether no part of the law with the effects of `fit` is a mass, damper or spring below zero."""
+        return self.model.passive(*self.parted(fit.terms, fit.values))
+
     def late_s(self, terms: tuple[Term, ...], values: Array) -> float:
         """Dead time of all terms together (s)."""
         return sum(max(float(value), 0.0) for p, value in zip(self.parameters(terms), values, strict=True) if p.dead_time)

@@ -148,12 +148,15 @@ def _weighed(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: 
     return np.where(np.abs(r) < RAN_AWAY, r, np.nan)
 
 
-def _answers(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: Mask) -> tuple[Array, Array, list[_State]]:
-    """Weighted residual (samples,) of a recording and its change (samples, k) per standard deviation of each state.
+def _answers(
+    problem: Problem, segment: Segment, fit: Fit, values: Array, mask: Mask, only: list[_State] | None = None
+) -> tuple[Array, Array, list[_State]]:
+    """Weighted residual (samples,) of a recording and its change (samples, k) per standard deviation of each state, or of
+    `only` some of them.
 
     A state from which the simulation runs away, as a loop may that saturates, stays where it is: its change is zero.
     """
-    states = _states(problem, segment, fit)
+    states = _states(problem, segment, fit) if only is None else only
     r, columns = _weighed(problem, segment, fit, values, mask), []
     seen = np.isfinite(r)
     for state in states:
@@ -169,13 +172,13 @@ def _answers(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: 
     return np.where(seen, r, 0.0), np.array(columns).reshape(-1, r.size).T, states
 
 
-def answers_to_memories(problem: Problem, segment: Segment, fit: Fit) -> Array:
-    """Change (samples, k) of the weighted simulation of a recording per standard deviation of each memory at its begin.
+def answers_to_memories(problem: Problem, segment: Segment, fit: Fit) -> list[Array]:
+    """Change (samples,) of the weighted simulation of a recording per standard deviation of each memory at its begin.
 
     samples: those to fit, one output after the other.
     """
-    _, columns, states = _answers(problem, segment, fit, fit.values, segment.fit)
-    return columns[:, [k for k, state in enumerate(states) if state.key]]
+    memories = [state for state in _states(problem, segment, fit) if state.key]
+    return list(_answers(problem, segment, fit, fit.values, segment.fit, memories)[1].T) if memories else []
 
 
 def fit_with_states(problem: Problem, fit: Fit, steps: int) -> Fit:

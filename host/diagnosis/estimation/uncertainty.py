@@ -191,7 +191,7 @@ def _by_begin(problem: Problem, fit: Fit, base: Array) -> tuple[Array, Array]:
         own = (
             [] if begin is None else [column for _, column in answers_to_begin(problem, fit.terms, fit.values, base, begin)]
         )
-        for change in memories.T:
+        for change in memories:
             column = np.zeros(base.size)
             column[part] = change
             own.append(column)

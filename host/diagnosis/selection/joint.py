@@ -194,7 +194,7 @@ def _earned_over(problem: Problem, fit: Fit, alone: Fit) -> bool:
     """Whether the pair gains enough over one of its effects `alone`, on samples to fit and on held-out ones, and none of
     the two is at a bound, or makes the law an active one.
     """
-    if any(bound_by(fit, term) for term in fit.terms) or not problem.model.passive(*problem.parted(fit.terms, fit.values)):
+    if any(bound_by(fit, term) for term in fit.terms) or not problem.passive(fit):
         return False
     more = fit.fitted - alone.fitted
     held = problem.gain("heldout", alone.residuals, fit.residuals)

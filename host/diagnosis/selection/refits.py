@@ -190,7 +190,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened) -> Trial:
         problem.apart,
         any(segment.repeats for segment in problem.segments),
         _cancellable(problem, base) if fit.terms[-1].candidate.effect.cancels_noise else 0.0,
-        problem.model.passive(*problem.parted(fit.terms, fit.values)),
+        problem.passive(fit),
     )
 
 
