@@ -18,6 +18,8 @@ from host.studies.proof.worlds.nominal_arm import torques
 Array = np.ndarray
 STEP_S = 1e-3
 HUNG_kg = 1000.0  # of a load that hangs on the hinge: the heavier, the shorter the arm of the same moment
+UNTWISTED = 2e-4  # twist of a shaft over the load's motion: a tenth of the least noise
+SOFT = 1e-3  # impedance of a soft contact: the share of the acceleration without contact that the contact takes away
 _HEAD = f'<option timestep="{STEP_S}" gravity="{{gravity}}" integrator="implicitfast"/>'
 Control = Callable[[int, Any], None]  # (step, data): sets the controls
 
@@ -126,7 +128,8 @@ class Gear(ode.Link):
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         c, (time_s, lead), gain = setup.scales, _clock(setup, i), setup.parameters["gain"]
         wanted = c.motion * windows.command(setup, i, 0)(time_s)
-        other, load = windows.command(setup, i, 1)(time_s), c.force * windows.command(setup, i, 2)(time_s)
+        other = windows.command(setup, i, 1)(time_s)
+        load = self._torque(setup, planted) * windows.command(setup, i, 2)(time_s)
         xml = self._xml(setup, planted)
         noise = np.repeat(setup.noise(i, "load_rad"), setup.style["every"])
         slow = [0.0]
@@ -154,16 +157,29 @@ class Gear(ode.Link):
 
     def _pull(self, planted: Sequence[Planted], setup: Setup, data: Any, other: float, load: float) -> float:
         """Return the torque (N m) by which effects outside the vocabulary turn the load behind its elastic shaft."""
-        c, stiffness = setup.scales, self._stiffness(setup)
+        stiffness = self._stiffness(setup)
         product = _only(planted, "stiffness that the other motor changes")
         if product:
             return stiffness * product["size"] * float(data.qpos[1]) * other
         ratio = _only(planted, "ratio that the load torque changes")
-        return stiffness * ratio["size"] * float(data.qpos[0]) * load / c.force if ratio else 0.0
+        size = self._torque(setup, planted)
+        return stiffness * ratio["size"] * float(data.qpos[0]) * load / size if ratio else 0.0
 
     def _stiffness(self, setup: Setup) -> float:
         """Return the stiffness (N m/rad) of a shaft whose mode with the load lies far above the excitation."""
         return 1e-3 * (12.0 / setup.scales.slow_s) ** 2
+
+    def _torque(self, setup: Setup, planted: Sequence[Planted]) -> float:
+        """Return the size (N m) of the recorded torque at the load.
+
+        A hanging mass and the effects outside the vocabulary act behind an elastic shaft. There the torque is so small that
+        it does not twist the shaft: a compliance would be a second effect, which the label does not name.
+        """
+        c = setup.scales
+        carried = _only(planted, "gravity_load") or _only(planted, "unlisted")
+        if not carried or _only(planted, "compliance") or _only(planted, "resonance"):
+            return c.force
+        return min(c.force, UNTWISTED * setup.parameters["gain"] * c.motion * self._stiffness(setup))
 
     def _xml(self, setup: Setup, planted: Sequence[Planted]) -> str:
         """Return the MJCF: motor and load joint, coupled by an equality, a limited tendon, or a tendon spring."""
@@ -235,7 +251,12 @@ _SLIDER_EFFECTS = (
     Plantable("coulomb_friction", _AXIS, lambda s, c: {"force_N": 0.05 * c.force * s}, compared=("force_N",), says="floor"),
     Plantable("rate_lag", _AXIS, lambda s, c: {"time_constant_s": 0.15 * c.slow_s * s}, compared=("time_constant_s",)),
     Plantable("saturation", _AXIS, lambda s, c: {"limit_N": 1.1 * c.force / (1.0 + 0.3 * s)}, compared=("limit_N",)),
-    Plantable("latency", _AXIS, lambda s, c: {"delay_s": 0.15 * c.slow_s * s}, compared=("delay_s",)),
+    Plantable(
+        "latency",
+        _AXIS,
+        lambda s, c: {"delay_s": STEP_S * round(0.15 * c.slow_s * s / STEP_S)},  # commands wait for whole steps
+        compared=("delay_s",),
+    ),
     Plantable("resonance", _AXIS, lambda s, c: {"share": min(0.1 * s, 1.0), "frequency_Hz": 1.6 / (2.0 * np.pi * c.slow_s)}),
     Plantable(
         "periodic_disturbance",
@@ -339,8 +360,9 @@ class Slider(ode.Axis):
         up = '<joint name="up" type="slide" axis="0 0 1"/>' if floor else ""
         slide = f"{floor / (p['mass'] * 9.81)} 0 0"
         touch = f'contype="1" conaffinity="1" friction="{slide}" condim="3"' if floor else 'contype="0" conaffinity="0"'
+        # "actearly": the force follows the state after the step; without it MuJoCo adds a delay of one step to the lag
         lagged = (
-            f'<general joint="x" dyntype="filterexact" dynprm="{lag}" gainprm="1" biastype="none"'
+            f'<general joint="x" dyntype="filterexact" dynprm="{lag}" gainprm="1" biastype="none" actearly="true"'
             if lag
             else '<motor joint="x"'
         )
@@ -450,12 +472,11 @@ class Pad(ode.Press):
                 f'<tendon><fixed stiffness="{k}" springlength="0"><joint joint="x" coef="1"/><joint joint="arm" coef="-1"/>'
                 "</fixed></tendon>"
             )
-        if wall:  # MuJoCo's soft contact, stiffness given directly (negative solref)
+        if wall:  # MuJoCo's soft contact, stiffness given directly (negative solref); SOFT of the inertia is held back, too
             k = wall["stiffness"]
             touch = (
-                '<geom type="sphere" size="0.01" contype="1" conaffinity="1" condim="1"'
-                f' solref="{-k / p["mass"]} {-0.1 * k * c.slow_s / p["mass"]}"'
-                ' solimp="0 0.95 0.001"/>'
+                '<geom type="sphere" size="0.01" contype="1" conaffinity="1" condim="1" priority="1"'
+                f' solref="{-k / p["mass"]} {-0.1 * k * c.slow_s / p["mass"]}" solimp="{SOFT} {SOFT} 0.001"/>'
             )
         plane = (
             f'<geom type="plane" size="1 1 1" pos="{0.2 * c.motion + 0.01} 0 0" zaxis="-1 0 0"'
@@ -463,10 +484,10 @@ class Pad(ode.Press):
             if wall
             else ""
         )
-        return f"""<mujoco>{_HEAD.format(gravity="0 0 0")}<worldbody>{plane}{maxwell}
+        return f"""<mujoco>{_HEAD.format(gravity="0 0 0")}<worldbody>{plane}
 <body><joint name="x" type="slide" axis="1 0 0" stiffness="{p["stiffness"]}" damping="{p["damping"]}"
 frictionloss="{loss.get("force_N", 0.0)}"/>
-<inertial pos="0 0 0" mass="{p["mass"]}" diaginertia="1 1 1"/>{touch}</body></worldbody>
+<inertial pos="0 0 0" mass="{p["mass"]}" diaginertia="1 1 1"/>{touch}</body>{maxwell}</worldbody>
 {tendon}<actuator><motor joint="x"/></actuator></mujoco>"""
 
     def left(self, setup: Setup, traces: Sequence[Trace]) -> list[Columns]:

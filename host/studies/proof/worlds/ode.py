@@ -94,7 +94,7 @@ def moved(x: Array, other: Array, load: Array, h: float, time_s: Array, planted:
 def _move(x: Array, other: Array, load: Array, h: float, time_s: Array, one: Planted, c: Scales) -> Array:
     q, name = one.parameters, one.effect.id
     simple = {
-        "backlash": lambda: op.play(x, h, q["width"]),
+        "backlash": lambda: op.play(x, q["width"]),
         "presliding_friction": lambda: op.prandtl_ishlinskii(x, q["share"], q["distance"]),
         "rate_lag": lambda: op.lag(x, h, q["time_constant_s"]),
         "latency": lambda: op.delayed(x, h, q["delay_s"]),
@@ -484,8 +484,7 @@ class Axis(SeparateRecordings):
     def left(self, setup: Setup, traces: Sequence[Trace]) -> list[Columns]:
         """Return what the refitted nominal law leaves: of the force for a free axis, else of the position."""
         if not self.sprung:
-            rows = [np.column_stack([t.hidden["a"], t.hidden["v"], np.ones(t.hidden["a"].size)]) for t in traces]
-            force = [t.channels["drive_N"] for t in traces]
+            rows, force = zip(*(_over_intervals(setup, i, t) for i, t in enumerate(traces)), strict=True)
             rest = without(np.vstack(rows), np.concatenate(force), sum(len(r) for r in rows[:-1]))
             return [{"drive_N": part} for part in split(rest, [r[:, 0] for r in rows])]
         law = np.array([setup.parameters[k] for k in ("mass", "damping", "stiffness", "offset")])
@@ -572,6 +571,16 @@ def _planted_forces(planted: Sequence[Planted], setup: Setup) -> tuple[drive.Act
 
 
 _NO_EFFECTS = (np.zeros(0, np.int64), np.zeros((0, 4)))
+
+
+def _over_intervals(setup: Setup, i: int, trace: Trace) -> tuple[Array, Array]:
+    """Return columns (n - 1, 3) of mass, damping and offset, and the force (n - 1,), each the mean over a sampling interval.
+
+    At the samples themselves a held force jumps: there, the shortest delay would look like one of a whole sample.
+    """
+    span, force = np.diff(setup.stamps[i]), trace.channels["drive_N"]
+    columns = [np.diff(trace.hidden["v"]) / span, np.diff(trace.channels["position_m"]) / span, np.ones(span.size)]
+    return np.column_stack(columns), force[:-1] if setup.style["held"] else 0.5 * (force[1:] + force[:-1])
 
 
 def replayed(setup: Setup, i: int, law: Array, trace: Trace) -> Array:

@@ -1,6 +1,6 @@
 """What a signal becomes on a fine time grid: hysteresis, delay, creep and modes by formulas that the finder does not use.
 
-Play is a follower behind a contact spring, presliding a Prandtl-Ishlinskii operator, creep a chain of Kelvin elements in
+Play engages gradually, presliding is a Prandtl-Ishlinskii operator, creep a chain of Kelvin elements in
 logarithmic spacing, saturation an algebraic sigmoid. Every operator takes x (n,) on an even grid of step h (s) and returns
 (n,).
 """
@@ -14,21 +14,19 @@ from numba import njit
 from scipy.signal import lfilter
 
 Array = np.ndarray
-FOLLOW_S = 1.5e-3  # time constant of the follower behind a gap
+ENGAGING = 6.0  # power of the taken-up share of a gap with which its flanks pass motion on
 
 
 @njit(cache=True)
-def play(x: Array, h: float, width: float) -> Array:
-    """Follower that a stiff contact pushes once a gap of `width` is taken up."""
+def play(x: Array, width: float) -> Array:
+    """Follower behind a gap of `width` whose flanks give way: it takes ever more of the motion as the gap is taken up."""
     out = np.empty_like(x)
-    y = x[0]
-    a = 1.0 - math.exp(-h / FOLLOW_S)
+    y, before, half = x[0], x[0], 0.5 * width
     for i in range(x.size):
-        gap = x[i] - y
-        if gap > 0.5 * width:
-            y += a * (gap - 0.5 * width)
-        elif gap < -0.5 * width:
-            y += a * (gap + 0.5 * width)
+        step, before = x[i] - before, x[i]
+        taken_up = (before - step - y) * math.copysign(1.0, step) / half if half > 0.0 else 1.0
+        y += step * min(max(taken_up, 0.0), 1.0) ** ENGAGING
+        y = min(max(y, x[i] - half), x[i] + half)
         out[i] = y
     return out
 
