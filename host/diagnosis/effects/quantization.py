@@ -43,7 +43,8 @@ def from_saw_tooth(evidence: Evidence, parameters: tuple[Parameter, ...], unit: 
     if not span > high:
         return tuple(replace(p, grid=()) for p in parameters)
     turns = np.arange(1.0 / high, min(1.0 / low, MOST_STEPS / span), 0.2 / span)
-    follows = np.array([float(rest @ np.sin(2.0 * np.pi * k * place)) / k for k in turns])
+    # not over k, as a saw tooth's height would be: that prefers coarse steps, which follow the noise
+    follows = np.array([float(rest @ np.sin(2.0 * np.pi * k * place)) for k in turns])
     best = turns[np.argsort(follows)[:3]]
     grid = tuple(float(1.0 / k) for k in best)
     return (replace(parameters[0], grid=grid, low=0.5 * low, high=2.0 * high, step=0.01 * low),)

@@ -265,6 +265,21 @@ def test_steps_of_recordings_without_noise_are_searched_in_bounded_time(step_m: 
         assert min(abs(size / step_m - 1.0) for size in step.grid) < 0.02
 
 
+def test_a_coarser_step_that_follows_the_noise_is_not_preferred() -> None:
+    """Six readings of a tracker with steps of 0.26 to 0.4 mm got starts at twice the step or more, and no quantization."""
+    rng = np.random.default_rng(3)
+    for step_m in (2.6e-4, 4e-4):
+        readings = []
+        for size, middle in ((5e-3, 0.0), (8e-3, 2e-3), (1.6e-2, 2e-2), (1.2e-4, 0.0), (3e-4, 0.0), (6e-3, 4e-3)):
+            for _ in range(2):
+                place = middle + size * np.sin(0.017 * np.arange(1200) * rng.uniform(0.8, 1.2))
+                told = place + 3e-5 * rng.standard_normal() + 2e-5 * np.sin(0.005 * np.arange(1200))
+                residual = step_m * np.round(place / step_m) + 1.26e-4 * rng.standard_normal(1200) - told
+                readings.append(Reading("m", told, residual, float(np.std(residual))))
+        (step,) = from_saw_tooth(Evidence((), (), tuple(readings), True), (Parameter("step", "m", (1.0,), 0.0, 1.0),), "m")
+        assert min(abs(size / step_m - 1.0) for size in step.grid) < 0.01
+
+
 @pytest.mark.parametrize(
     ("probability", "alternatives", "says"),
     [
