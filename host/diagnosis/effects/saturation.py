@@ -33,6 +33,17 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(np.minimum(signal, p[0]) if form == "upper" else np.maximum(signal, p[0]))
 
 
+def of_gradual(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Return the parameter `limit`, which the largest signal may come near or lie beyond."""
+    top = max(abs(s.low), abs(s.high))
+    return (Parameter("limit", s.unit, tuple(f * top for f in (0.7, 1.0, 1.5, 2.5)), 0.1 * top, 20.0 * top, log=True),)
+
+
+def apply_gradual(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Signal (n,) that comes ever closer to p[0], at either side, and follows as it is near zero."""
+    return np.asarray(p[0] * np.tanh(signal / p[0]))
+
+
 def largest(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Return the parameter `limit`, the largest reading of either sign."""
     top = max(abs(s.low), abs(s.high))
@@ -134,6 +145,18 @@ EFFECTS = (
         for port in ("motion", "limit")
     )
     + (
+        # not of a motion: a curve between two motions is not known to have a limit
+        Effect(
+            "saturation",
+            "limit",
+            34,
+            of_gradual,
+            "The output follows ever less, up to {limit} at either side.",
+            "y = limit*tanh(x/limit)",
+            apply_gradual,
+            forms=("gradual",),
+            natural_bounds=True,
+        ),
         Effect(
             "saturation",
             "forces",

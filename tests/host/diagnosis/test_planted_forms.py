@@ -425,3 +425,25 @@ def test_no_second_mass_makes_up_for_what_differences_of_a_motion_lack(noise_m: 
     result = diagnose([moving(seed) for seed in (1, 2, 3)], nominal).as_dict()
     assert result["verdict"] == "nothing_missing"
     assert result["fit"]["nominal_parameters"]["mass_N_s2_per_m"]["value"] == pytest.approx(0.05, rel=0.15)
+
+
+def test_a_drive_whose_gain_falls_gradually_is_a_limit() -> None:
+    """A clip rounded over a knee fitted it with a limit of 0.13 N and twice the gain, or its knee ended at its bound.
+
+    Then a hardening spring was named with 0.94.
+    """
+    limit, mass, damping, stiffness = 2.2, 0.7, 6.0, 150.0
+
+    def moving(seed: int) -> dict[str, Array]:
+        push, rng = motion(seed, (0.31, 0.77, 1.3, 2.2)), np.random.default_rng(60 + seed)
+        t = np.arange(0.0, 20.0, 0.01)
+
+        def rates(now: float, s: Array) -> list[float]:
+            u = 3.0 * float(push(now))
+            return [s[1], (u / np.hypot(1.0, u / limit) - damping * s[1] - stiffness * s[0]) / mass]
+
+        y = solve_ivp(rates, (-3.0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-8, atol=1e-11, max_step=0.02).y[0]
+        return {"t": t, "f": 3.0 * push(t), "x": y + 4e-5 * rng.normal(size=t.size)}
+
+    (effect,) = diagnose([moving(seed) for seed in (1, 2, 3)], axis_nominal()).as_dict()["effects"]
+    assert effect["id"] == "saturation" and effect["parameters"]["limit_N"]["value"] == pytest.approx(limit, rel=0.15)
