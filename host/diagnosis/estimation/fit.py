@@ -14,7 +14,7 @@ from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, Port, cornered
-from host.diagnosis.model.model import ActiveEffect, Begin, Model, Segment
+from host.diagnosis.model.model import ActiveEffect, Model, Segment
 
 Array = npt.NDArray[np.float64]
 RAN_AWAY = 1e12  # residual, in units of noise, beyond which a simulation has run away
@@ -333,15 +333,18 @@ class FreeStates:
 
 
 def answers_to_begin(
-    problem: Problem, terms: tuple[Term, ...], values: Array, base: Array, begin: Begin
+    problem: Problem, terms: tuple[Term, ...], values: Array, base: Array, segment: Segment
 ) -> list[tuple[int, Array]]:
     """Change of the weighted simulation by each unknown state that a recording begins with, for one standard deviation.
 
     base: stacked residuals with the states as they are. Where the simulation runs away from there, as that of a loop that
     saturates may, the state moves by a thousandth; if it runs away even so, the change is zero.
     """
+    begin = segment.begin
+    if begin is None:
+        return []
     out, now = [], begin.values
-    for k in np.flatnonzero(begin.spread > 0.0):
+    for k in problem.model.begins_with(segment, problem.parted(terms, values)[1]):
         column = np.zeros(base.size)
         for share in (1.0, 1e-3):
             begin.values = now + np.eye(now.size)[k] * share * begin.spread[k]
@@ -365,7 +368,7 @@ def free_states(problem: Problem, terms: tuple[Term, ...], values: Array) -> Fre
             continue
         left = base[part].reshape(rows, -1)
         level = float(np.mean([np.mean(row**2) * correlation_time(row) for row in left]))
-        for k, column in answers_to_begin(problem, terms, values, base, begin):
+        for k, column in answers_to_begin(problem, terms, values, base, segment):
             columns.append(column)
             away.append((begin.values[k] - begin.measured[k]) / begin.spread[k])
             levels.append(level)

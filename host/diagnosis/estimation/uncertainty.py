@@ -187,11 +187,8 @@ def _by_begin(problem: Problem, fit: Fit, base: Array) -> tuple[Array, Array]:
         part, at = slice(at, at + n), at + n
         if not n:
             continue
-        begin, memories = segment.begin, answers_to_memories(problem, segment, fit)
-        own = (
-            [] if begin is None else [column for _, column in answers_to_begin(problem, fit.terms, fit.values, base, begin)]
-        )
-        for change in memories:
+        own = [column for _, column in answers_to_begin(problem, fit.terms, fit.values, base, segment)]
+        for change in answers_to_memories(problem, segment, fit):
             column = np.zeros(base.size)
             column[part] = change
             own.append(column)

@@ -604,6 +604,14 @@ def _dry(v_old: float, v_free: float, a_free: float, dry: float, h: float, m: fl
 
 
 @njit(cache=True)
+def _begun(begin: Array) -> tuple[float, float, float, float]:
+    """Place and speed of the axis and of a second mass, which begins at rest on the axis if `begin` does not say where."""
+    if begin.size < 4:
+        return begin[0], begin[1], begin[0], begin[1]
+    return begin[0], begin[1], begin[0] + begin[2], begin[1] + begin[3]
+
+
+@njit(cache=True)
 def run_axis(
     u: Array,
     substeps: int,
@@ -621,7 +629,8 @@ def run_axis(
 
     Arguments:
         u: (n, substeps, 3) input at the start, middle and end of every sub-step; of no use with a controller.
-        linear: m, c, k, offset. begin: x and v at the first sample.
+        linear: m, c, k, offset. begin: x and v at the first sample; place and speed of the second mass from there, or
+            nothing if it begins at rest on the axis.
         control: (kp, kv, gain, limit) of a cascade controller, or empty. reference: (2, n) its reference, and what is
             added to its force. start: friction held at first. begin_s: time of the first sample.
     Returns:
@@ -632,7 +641,7 @@ def run_axis(
     n = load.size
     out = np.empty((4, n))
     m, offset, h = linear[0], linear[3], dt_s / substeps
-    s = (begin[0], begin[1], begin[0], begin[1])
+    s = _begun(begin)
     z = np.zeros(6)
     start_state(z, start, load[0], p)
     held, slow = hysteresis(z, 0.0, begin[1], load[0], p), begin[0] - relaxed_by(start, p)

@@ -30,6 +30,7 @@ from host.diagnosis.models import balance
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
+BEGINS = ("position", "speed", "second_place", "second_speed")  # the last two are those of a second mass from the axis
 READ = ("position", "velocity", "acceleration")
 SMOOTHING_S = 0.02
 UNSEEN_S = 0.05  # least scale of an initial position or speed that is not read
@@ -151,7 +152,12 @@ class AxisModel(Model):
         kick = np.abs(np.diff(segment.inputs[spec.input][: window + 1]))
         if spec.reads == "position" and np.max(kick) > KICK * np.median(np.abs(np.diff(segment.inputs[spec.input]))):
             spread[1] = max(spread[1], abs(v[0]))  # the window reads the speed behind the kick, not that before it
-        segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
+        # A second mass on a spring moves before the recording, too. Near its mode it may be elsewhere by all of the motion.
+        apart = np.array([np.ptp(place), np.ptp(np.gradient(place, recording.dt_s))])
+        known = np.array([*begin, 0.0, 0.0])
+        segment.begin = Begin(
+            BEGINS, known, np.concatenate((spread, np.where(spread > 0.0, apart, 0.0))), known.copy(), again
+        )
         segment.x, segment.v, segment.a = x, v, np.gradient(v, recording.dt_s)
         segment.substeps = self._substeps(segment)
         along = motion if spec.reads == "position" else place
@@ -178,6 +184,15 @@ class AxisModel(Model):
             segment.rests = balance.at_rest(x, segment.tolerances[name], segment.balance.support.size // 2)
             segment.spread, segment.read_motion = segment.balance.support.size // 2, recording.channels[spec.output]
         return segment
+
+    def begins_with(self, segment: Segment, active: list[ActiveEffect]) -> npt.NDArray[np.intp]:
+        """Place and speed of the axis, and those of a second mass if there is one."""
+        found = super().begins_with(segment, active)
+        second = any(
+            candidate.effect.slots is not None and "second_mass" in candidate.effect.slots(values, candidate.form)
+            for candidate, values in active
+        )
+        return found if second else found[found < 2]
 
     def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:
         """Drive and reading: the mass on its spring and damper between them is linear."""

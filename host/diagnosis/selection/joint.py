@@ -11,8 +11,10 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, get_starts, minimize, set_starts
+from host.diagnosis.estimation.initial_state import begun_again
+from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.refits import restarted
-from host.diagnosis.selection.screening import above_noise
+from host.diagnosis.selection.screening import above_noise, term_of
 from host.diagnosis.selection.trial import Trial, bound_by, of_sampling, related, sure_together
 
 Array = npt.NDArray[np.float64]
@@ -115,6 +117,51 @@ def pair_instead(problem: Problem, nominal: Fit, one: Fit, trials: list[Trial]) 
     set_starts(problem, begun)
     best = max(found, key=lambda pair: pair.score, default=None)
     return best, equal if best is None else []
+
+
+def second_mass_instead(problem: Problem, nominal: Fit, one: Fit, candidate_effects: list[Candidate]) -> PairFit | None:
+    """A part of the mass on a spring, and a delay or lag of the drive, in the place of the mode of the drive in `one`; None
+    if they do no better.
+
+    Such a mode is an effect of one place that does most of what the two do. Past it neither earns anything, and past a delay
+    or a lag the second mass promises little until it begins where it was.
+    """
+    n, term = len(nominal.values), one.terms[0]
+    second = next((c for c in candidate_effects if c.effect.as_mode and _of_same_mass(c, term.candidate)), None)
+    if second is None or second.effect.as_mode is None or problem.budget.spent():
+        return None
+    mode = dict(zip((p.name for p in term.parameters), map(float, one.values[n:]), strict=True))
+    own, (begin, late_s) = term_of(problem, second, one), second.effect.as_mode(mode)
+    begun, found = get_starts(problem), []
+    for candidate in candidate_effects:
+        if candidate.effect.shifts != "time" or candidate.form or candidate.port.name != term.candidate.port.name:
+            continue
+        set_starts(problem, begun)
+        terms = (term_of(problem, candidate, one), own)
+        start = np.array([late_s, *(begin[p.name] for p in own.parameters)])
+        fit = minimize(
+            problem,
+            terms,
+            np.concatenate((one.values[:n], start)),
+            rounds=problem.rules.further_iterations,
+            tolerance=1e-4,
+        )
+        fit = finish(problem, begun_again(problem, fit))
+        passed = _passed(problem, nominal, fit, get_starts(problem))
+        ahead = problem.gain("both", one.residuals, fit.residuals).log_likelihood
+        least = problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * max(fit.fitted - one.fitted, 0)
+        if passed is None or not ahead > least:
+            continue
+        if all(_earned_over(problem, fit, _alone(problem, nominal, fit, which)) for which in (0, 1)):
+            found.append(passed)
+    set_starts(problem, begun)
+    return max(found, key=lambda pair: pair.score, default=None)
+
+
+def _of_same_mass(second: Candidate, mode: Candidate) -> bool:
+    """Whether `second`, a second mass on an axis, may be what `mode` is taken for at the axis' drive."""
+    same = second.effect.id == mode.effect.id and second.port.subsystem == mode.port.subsystem
+    return same and second.port.name != mode.port.name
 
 
 def pair_first(problem: Problem, nominal: Fit, trials: list[Trial], progress: Progress) -> PairFit | None:

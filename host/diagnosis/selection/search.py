@@ -25,7 +25,7 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.corners import round_corners
 from host.diagnosis.selection.folds import with_other_recordings
 from host.diagnosis.selection.found import Found, SearchMove, Step
-from host.diagnosis.selection.joint import PairFit, best_pair, pair_first, pair_instead
+from host.diagnosis.selection.joint import PairFit, best_pair, pair_first, pair_instead, second_mass_instead
 from host.diagnosis.selection.lost_steps import lost_steps, without_lost_steps
 from host.diagnosis.selection.refits import fit_nominal, fit_without, refined, settled, try_fit
 from host.diagnosis.selection.removal import drop_unsure, drop_unsure_events, prune, reduce
@@ -159,6 +159,7 @@ def _grow(problem: Problem, found: Found, candidate_effects: list[Candidate], ea
         two = None
         if len(best.terms) == 1:
             two, found.pairs = pair_instead(problem, found.nominal, best, trials)
+            two = two or second_mass_instead(problem, found.nominal, best, candidate_effects)
         if two is not None:
             best = _joined(problem, two)
             steps += [Step(SearchMove.JOINT, term.candidate.key, two.heldout, trials) for term in best.terms]

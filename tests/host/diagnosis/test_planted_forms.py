@@ -366,7 +366,7 @@ def test_a_delay_is_found_past_a_limit_that_clips_the_same_reading(tmp_path: Pat
     The rate of a limit holds only until the next sample reaches it. A step along it hid what the delay takes.
     """
     pytest.importorskip("mujoco")
-    result = verdict_of("mujoco", 538291, 47, tmp_path)
+    result = verdict_of("mujoco", 538291, 47, tmp_path, attempt=1)
     assert [effect["id"] for effect in result["effects"]] == ["saturation", "latency"]
     low, high = result["effects"][1]["parameters"]["delay_s"]["ci95"]
     assert low <= 0.0286 <= high
@@ -447,3 +447,28 @@ def test_a_drive_whose_gain_falls_gradually_is_a_limit() -> None:
 
     (effect,) = diagnose([moving(seed) for seed in (1, 2, 3)], axis_nominal()).as_dict()["effects"]
     assert effect["id"] == "saturation" and effect["parameters"]["limit_N"]["value"] == pytest.approx(limit, rel=0.15)
+
+
+def test_a_second_mass_moves_before_the_recording_and_behind_a_lag_too() -> None:
+    """A mode in a share of the drive's motion was named with 0.94 for a lag of the drive and a part of the mass on a spring.
+
+    Each recording had the second mass at rest on the axis at its first sample.
+    """
+    lag, mass, damping, stiffness, share, omega = 0.03, 0.5, 5.0, 36.0, 0.28, 2.0 * np.pi * 1.7
+
+    def moving(seed: int) -> dict[str, Array]:
+        push, rng = motion(seed, (0.23, 0.51, 0.97, 1.4)), np.random.default_rng(80 + seed)
+        t = np.arange(0.0, 6.0, 0.004)
+
+        def rates(now: float, s: Array) -> list[float]:
+            pull = omega**2 * (s[0] - s[2]) + 0.2 * omega * (s[1] - s[3])
+            force = s[4] - damping * s[1] - stiffness * s[0]
+            return [s[1], force / mass - share * pull, s[3], pull, (float(push(now)) - s[4]) / lag]
+
+        y = solve_ivp(rates, (-6.0, t[-1]), np.zeros(5), t_eval=t, rtol=1e-8, atol=1e-11, max_step=0.02).y[0]
+        return {"t": t, "f": push(t), "x": y + 5e-5 * rng.normal(size=t.size)}
+
+    effects = {e["id"]: e for e in diagnose([moving(seed) for seed in (1, 2, 3)], axis_nominal()).as_dict()["effects"]}
+    assert set(effects) == {"rate_lag", "resonance"}
+    assert effects["rate_lag"]["parameters"]["time_constant_s"]["value"] == pytest.approx(lag, rel=0.1)
+    assert effects["resonance"]["parameters"]["frequency_Hz"]["value"] == pytest.approx(1.7, rel=0.03)
