@@ -344,7 +344,7 @@ def answers_to_begin(
     if begin is None:
         return []
     out, now = [], begin.values
-    for k in problem.model.begins_with(segment, problem.parted(terms, values)[1]):
+    for k in problem.model.begins_with(segment, *problem.parted(terms, values)):
         column = np.zeros(base.size)
         for share in (1.0, 1e-3):
             begin.values = now + np.eye(now.size)[k] * share * begin.spread[k]

@@ -37,7 +37,7 @@ def estimate_state(model: Model, segment: Segment, theta: Array, active: list[Ac
     begin = segment.begin
     if begin is None or not begin.estimated:
         return
-    moving = model.begins_with(segment, active)
+    moving = model.begins_with(segment, theta, active)
     if not moving.size:
         return
     begin.values = begin.measured.copy()
@@ -118,7 +118,7 @@ def _states(problem: Problem, segment: Segment, fit: Fit) -> list[_State]:
     """Every unknown number that `segment` begins with: of its model's state, and of memories that fade with time."""
     found, begin = [], segment.begin
     if begin is not None and begin.estimated:
-        for k in problem.model.begins_with(segment, problem.parted(fit.terms, fit.values)[1]):
+        for k in problem.model.begins_with(segment, *problem.parted(fit.terms, fit.values)):
             found.append(_State(segment, float(begin.measured[k]), float(begin.spread[k]), int(k)))
     for term in fit.terms:
         candidate = term.candidate

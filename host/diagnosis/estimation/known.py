@@ -83,6 +83,10 @@ class Known(Model):
         """Outputs (outputs, n) with the known effects at work."""
         return self._inner.simulate(segment, theta[: self.own], self.with_known(theta, active))
 
+    def begins_with(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> npt.NDArray[np.intp]:
+        """Return the unknown states that show with the known effects."""
+        return self._inner.begins_with(segment, theta[: self.own], self.with_known(theta, active))
+
     def passive(self, theta: Array, active: list[ActiveEffect]) -> bool:
         """Whether the law with the known effects is passive."""
         return self._inner.passive(theta[: self.own], self.with_known(theta, active))

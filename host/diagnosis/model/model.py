@@ -128,7 +128,7 @@ class Model(ABC):
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """The displacement or force (n,) that `port` would need to explain `residual` (outputs, n)."""
 
-    def begins_with(self, segment: Segment, active: list[ActiveEffect]) -> npt.NDArray[np.intp]:
+    def begins_with(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> npt.NDArray[np.intp]:
         """Indices (k,) of the unknown states that `segment` begins with and that show in its outputs."""
         return np.flatnonzero(segment.begin.spread if segment.begin is not None else ())
 

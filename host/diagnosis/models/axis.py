@@ -185,9 +185,9 @@ class AxisModel(Model):
             segment.spread, segment.read_motion = segment.balance.support.size // 2, recording.channels[spec.output]
         return segment
 
-    def begins_with(self, segment: Segment, active: list[ActiveEffect]) -> npt.NDArray[np.intp]:
+    def begins_with(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> npt.NDArray[np.intp]:
         """Place and speed of the axis, and those of a second mass if there is one."""
-        found = super().begins_with(segment, active)
+        found = super().begins_with(segment, theta, active)
         second = any(
             candidate.effect.slots is not None and "second_mass" in candidate.effect.slots(values, candidate.form)
             for candidate, values in active

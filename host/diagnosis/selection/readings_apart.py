@@ -256,7 +256,7 @@ def _freed(problem: Problem, segment: Segment, theta: Array) -> tuple[Array, Arr
     begin = segment.begin
     if begin is not None:
         now = begin.values
-        for k in problem.model.begins_with(segment, []):
+        for k in problem.model.begins_with(segment, theta, []):
             begin.values = now + np.eye(now.size)[k] * begin.spread[k]
             states.append(np.asarray(problem.model.simulate(segment, theta, [])) - simulated)
         begin.values = now

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy import signal
 
@@ -328,8 +330,21 @@ def test_a_state_from_which_a_loop_runs_away_moves_less_or_not_at_all(reach: flo
     """Residuals of 1 - 2 x as far as `reach`, beyond it the loop runs away. That ended in a LinAlgError."""
     begin = Begin(("x",), np.zeros(1), np.ones(1), np.zeros(1))
 
+    class OneState:
+        """A model that begins with x."""
+
+        def begins_with(self, segment: Any, theta: Any, active: Any) -> npt.NDArray[np.intp]:
+            """Return the index of x."""
+            return np.zeros(1, dtype=np.intp)
+
     class Loop:
         """A problem whose only state is x."""
+
+        model = OneState()
+
+        def parted(self, terms: Any, values: Any) -> tuple[Any, list[Any]]:
+            """Return no effects."""
+            return values, []
 
         def stacked(self, terms: Any, values: Any) -> Array:
             """Return 3 residuals, cut where the simulation ran away."""
@@ -337,7 +352,8 @@ def test_a_state_from_which_a_loop_runs_away_moves_less_or_not_at_all(reach: flo
             return np.full(3, 1.0 - 2.0 * x if abs(x) <= reach else FAR)
 
     problem: Any = Loop()
-    ((index, column),) = answers_to_begin(problem, (), np.zeros(0), problem.stacked((), ()), begin)
+    segment: Any = SimpleNamespace(begin=begin)
+    ((index, column),) = answers_to_begin(problem, (), np.zeros(0), problem.stacked((), ()), segment)
     assert index == 0 and np.allclose(-column, expected) and np.all(begin.values == 0.0)
 
 
