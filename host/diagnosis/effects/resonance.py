@@ -87,10 +87,12 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"second_mass": p[0], "second_omega": 2.0 * np.pi * p[1], "second_damping": p[2]}
 
 
-def from_mode(mode: dict[str, float]) -> tuple[dict[str, float], float]:
+def from_mode(mode: dict[str, float]) -> tuple[dict[str, float], float] | None:
     """Start values from a mode in which a share of the drive's motion takes part, or a load on the drive; and by how long
-    (s) that mode is late when the motion is slow.
+    (s) that mode is late when the motion is slow. None for a resonance of other parameters: a mass, or one with a dead time.
     """
+    if "damping_ratio" not in mode:
+        return None
     share, damping_ratio = mode.get("mode_share", mode.get("load_ratio", 1.0)), mode["damping_ratio"]
     late_s = share * damping_ratio / (np.pi * mode["frequency"])
     return {"mass_share": share, "frequency": mode["frequency"], "damping_ratio": damping_ratio}, late_s

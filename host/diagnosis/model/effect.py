@@ -187,7 +187,7 @@ class Effect:
     invariant: bool = False  # linear and time-invariant: before or behind a linear plant it does the same
     rounded: bool = False  # a law without its corner: it takes the place of that law where the data call for it
     # Start values from the parameters of a mode of the drive that may be taken for it, and how late (s) the drive then is.
-    as_mode: Callable[[dict[str, float]], tuple[dict[str, float], float]] | None = None
+    as_mode: Callable[[dict[str, float]], tuple[dict[str, float], float] | None] | None = None
     affine: bool = False  # a reading times a constant plus a constant: a state that is read begins elsewhere with it
 
     @property

@@ -130,8 +130,10 @@ def second_mass_instead(problem: Problem, nominal: Fit, one: Fit, candidate_effe
     second = next((c for c in candidate_effects if c.effect.as_mode and _of_same_mass(c, term.candidate)), None)
     if second is None or second.effect.as_mode is None or problem.budget.spent():
         return None
-    mode = dict(zip((p.name for p in term.parameters), map(float, one.values[n:]), strict=True))
-    own, (begin, late_s) = term_of(problem, second, one), second.effect.as_mode(mode)
+    mode = second.effect.as_mode(dict(zip((p.name for p in term.parameters), map(float, one.values[n:]), strict=True)))
+    if mode is None:
+        return None
+    own, (begin, late_s) = term_of(problem, second, one), mode
     begun, found = get_starts(problem), []
     for candidate in candidate_effects:
         if candidate.effect.shifts != "time" or candidate.form or candidate.port.name != term.candidate.port.name:

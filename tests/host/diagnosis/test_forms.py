@@ -14,6 +14,7 @@ from host.diagnosis.effects import library
 from host.diagnosis.effects.dead_time import corner
 from host.diagnosis.effects.missed_steps import change_points
 from host.diagnosis.effects.reference import table
+from host.diagnosis.effects.resonance import from_mode
 from host.diagnosis.model import operators as op
 from host.diagnosis.model.effect import Scale
 from host.diagnosis.model.force_kernel import run_axis, slot_array
@@ -157,3 +158,17 @@ def test_friction_that_rises_with_speed_is_simulated_in_long_steps(rise: float, 
     law, none = np.array([0.5, 3.0, 40.0, 0.0]), np.zeros(t.size)
     run = run_axis(stages, 2, 0.01, law, slot_array([slots]), np.zeros(2), none, np.zeros(0), none[None], 0.0, 0.0)
     assert float(np.std(run[0] - wanted)) < 2e-3 * float(np.std(wanted))
+
+
+@pytest.mark.parametrize(
+    ("form", "has"), [("share", True), ("drive", True), ("", True), ("dead_time", False), ("mass", False)]
+)
+def test_only_a_mode_may_be_taken_for_a_second_mass(form: str, has: bool) -> None:
+    """A resonance with a dead time does not state its damping ratio: the comparison ended in a KeyError (suite `ode`)."""
+    scale = Scale("N", 2.0, -1.0, 1.0, 1.0, 1e-6, 0.1, 0.01, 10.0, True)
+    modes = [effect for effect in library() if "resonance" in (effect.id, *effect.spans) and form in effect.forms]
+    modes = [effect for effect in modes if form or effect.slots is None]  # the other is the second mass itself
+    assert modes
+    for effect in modes:
+        begin = from_mode({p.name: p.grid[0] for p in effect.parameters(scale, form)})
+        assert (begin is not None) is has
