@@ -128,6 +128,21 @@ def test_what_carries_an_effect_leaves_nothing_itself(world: str, closed: bool) 
     assert not wrong and measured > 0.8 * effects
 
 
+@pytest.mark.parametrize("number", range(4))
+def test_a_hanging_mass_pulls_and_adds_no_inertia(number: int) -> None:
+    """As a body it made a mode within the recording, which was rightly named a resonance in three cases of seed 905137."""
+    pytest.importorskip("mujoco")
+    gear = next(m for m in suite.mechanisms("mujoco") if m.name == "gear")
+    setup = gear.draw(np.random.default_rng([number, 31]), False)
+    effect = next(e for e in gear.effects if e.id == "gravity_load")
+    pull = effect.make(16.0, setup.scales)
+    (trace, *_) = gear.run(setup, [case.Planted(effect, 16.0, pull)])
+    gain, motion = setup.parameters["gain"], setup.scales.motion
+    motor, load = trace.channels["motor_rad"], trace.channels["load_rad"]
+    at_rest = gain * motor - pull["share"] * gain * motion * np.sin(load)  # spring and weight hold each other
+    assert np.sqrt(np.mean((load - at_rest) ** 2)) < 0.01 * np.std(load)
+
+
 def _rho(mechanism: case.Mechanism, setup: case.Setup, *planted: case.Planted) -> float:
     """Return the size of what the nominal model leaves, or NaN where the loop does not settle: then a case is drawn anew."""
     try:

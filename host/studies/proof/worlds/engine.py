@@ -17,7 +17,7 @@ from host.studies.proof.worlds.nominal_arm import torques
 
 Array = np.ndarray
 STEP_S = 1e-3
-HUNG_kg = 1000.0  # of a load that hangs on the hinge: the heavier, the shorter the arm of the same moment
+LOAD_kg_m2 = 1e-3  # inertia of a gear's load
 UNTWISTED = 2e-4  # twist of a shaft over the load's motion: a tenth of the least noise
 SOFT = 1e-3  # impedance of a soft contact: the share of the acceleration without contact that the contact takes away
 _HEAD = f'<option timestep="{STEP_S}" gravity="{{gravity}}" integrator="implicitfast"/>'
@@ -156,8 +156,15 @@ class Gear(ode.Link):
         return Trace(columns)
 
     def _pull(self, planted: Sequence[Planted], setup: Setup, data: Any, other: float, load: float) -> float:
-        """Return the torque (N m) by which effects outside the vocabulary turn the load behind its elastic shaft."""
-        stiffness = self._stiffness(setup)
+        """Return the torque (N m) of a hanging mass, or of an effect outside the vocabulary, at the load behind its shaft.
+
+        The mass hangs on an arm without length in the plane of rotation: as a body, it added up to 300 times the inertia of
+        the load, a mode within the recording that no label named.
+        """
+        hang, stiffness = _only(planted, "gravity_load"), self._stiffness(setup)
+        if hang:
+            moment = self._shaft(setup, planted) * hang["share"] * setup.parameters["gain"] * setup.scales.motion
+            return -moment * float(np.sin(data.qpos[1]))
         product = _only(planted, "stiffness that the other motor changes")
         if product:
             return stiffness * product["size"] * float(data.qpos[1]) * other
@@ -168,6 +175,15 @@ class Gear(ode.Link):
     def _stiffness(self, setup: Setup) -> float:
         """Return the stiffness (N m/rad) of a shaft whose mode with the load lies far above the excitation."""
         return 1e-3 * (12.0 / setup.scales.slow_s) ** 2
+
+    def _shaft(self, setup: Setup, planted: Sequence[Planted]) -> float:
+        """Return the stiffness (N m/rad) between motor and load; 0 where they turn as one."""
+        soft, mode = _only(planted, "compliance"), _only(planted, "resonance")
+        if mode:
+            return LOAD_kg_m2 * float(2.0 * np.pi * mode["frequency_Hz"]) ** 2
+        if soft:
+            return setup.scales.force / soft["deflection_rad"]
+        return self._stiffness(setup) if _only(planted, "gravity_load") or _only(planted, "unlisted") else 0.0
 
     def _torque(self, setup: Setup, planted: Sequence[Planted]) -> float:
         """Return the size (N m) of the recorded torque at the load.
@@ -184,16 +200,9 @@ class Gear(ode.Link):
     def _xml(self, setup: Setup, planted: Sequence[Planted]) -> str:
         """Return the MJCF: motor and load joint, coupled by an equality, a limited tendon, or a tendon spring."""
         c, gain = setup.scales, setup.parameters["gain"]
-        inertia, stiffness, friction, weight = 1e-3, 0.0, 0.0, 0.0
+        inertia, stiffness, friction = LOAD_kg_m2, self._shaft(setup, planted), 0.0
         gap, bend = _only(planted, "backlash"), _only(planted, "static_nonlinearity").get("cubic", 0.0)
-        soft, mode, hang = (_only(planted, name) for name in ("compliance", "resonance", "gravity_load"))
-        if soft:
-            stiffness = c.force / soft["deflection_rad"]
-        if mode:
-            stiffness = inertia * (2.0 * np.pi * mode["frequency_Hz"]) ** 2
-        if hang or _only(planted, "unlisted"):
-            stiffness = stiffness or self._stiffness(setup)
-            weight = hang.get("share", 0.0) * gain * c.motion * stiffness / 9.81
+        soft, mode = _only(planted, "compliance"), _only(planted, "resonance")
         if stiffness and not mode:  # keep the load's own mode out of the recording
             inertia = min(inertia, stiffness * ((0.05 if soft else 0.02) * c.slow_s) ** 2)
         if gap:
@@ -214,12 +223,11 @@ class Gear(ode.Link):
             f'<tendon><fixed name="belt" {limit} stiffness="{stiffness}" damping="{damping}" springlength="0">'
             f'<joint joint="load" coef="1"/><joint joint="motor" coef="{-gain}"/></fixed></tendon>'
         )
-        # the weight hangs on the load's hinge, whose axis is level, on an arm so short that it adds hardly any inertia
-        return f"""<mujoco>{_HEAD.format(gravity="0 0 -9.81" if hang else "0 0 0")}
+        return f"""<mujoco>{_HEAD.format(gravity="0 0 0")}
 <worldbody>
 <body><joint name="motor" type="hinge" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body>
 <body><joint name="load" type="hinge" axis="0 1 0" damping="{1e-6}" frictionloss="{friction}"/>
-<inertial pos="0 0 {-weight / HUNG_kg}" mass="{HUNG_kg}" diaginertia="{inertia} {inertia} {inertia}"/></body>
+<inertial pos="0 0 0" mass="1" diaginertia="{inertia} {inertia} {inertia}"/></body>
 </worldbody>
 {joined if gap or stiffness else rigid}
 <actuator><position joint="motor" kp="400" kv="8"/><motor joint="load"/></actuator></mujoco>"""
