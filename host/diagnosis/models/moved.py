@@ -45,13 +45,14 @@ class Moved:
         window = smoothing_window(motion, recording.dt_s, noise, SMOOTHING_S) if recording.timed else 7
         tolerance = tolerance_of(motion, float(np.ptp(motion)))
         clean = noise < CLEAN * tolerance
-        windows = [window] * 3
-        if not clean:  # each derivative with the window of its own least error, no wider than the band allows
-            widest, least = round(WIDER * window) | 1, (LEAST_WINDOW, LEAST_WINDOW, DEGREE + 2)
-            best = [widest] * 3
-            if recording.timed and motion.size >= SHORTEST:
-                best = [least_error_window(motion, recording.dt_s, noise, DEGREE, order) for order in (0, 1, 2)]
-            windows = [max(min(one, widest), short) for one, short in zip(best, least, strict=True)]
+        # Each derivative with the window of its own least error, no wider than the band allows. That of a clean motion is
+        # narrower: an acceleration over the whole band is too small where the motion turns sharply.
+        widest = window if clean else round(WIDER * window) | 1
+        least = (LEAST_WINDOW, DEGREE + 2 if clean else LEAST_WINDOW, DEGREE + 2)
+        best = [widest] * 3
+        if recording.timed and motion.size >= SHORTEST:
+            best = [least_error_window(motion, recording.dt_s, noise, DEGREE, order) for order in (0, 1, 2)]
+        windows = [max(min(one, widest), short) for one, short in zip(best, least, strict=True)]
         x, v, a = (smooth_derivatives(motion, recording.dt_s, one, DEGREE)[k] for k, one in enumerate(windows))
         # smoothing a clean motion would round its reversals, and friction with them
         taken = (1 if clean else windows[0], windows[1], windows[2])
