@@ -91,7 +91,8 @@ def _failures(run: Path, worlds: Sequence[str] = ()) -> str:
             if (worlds and world not in worlds) or judge(label, verdict).right:
                 continue
             named = ", ".join(_effect(e) for e in verdict.get("effects") or [])
-            said = verdict.get("error") or f"{str(verdict.get('verdict')).replace('_', ' ')} {named}".strip()
+            failed = str(verdict.get("error") or "").partition("; the traceback")[0]  # that names a file of one machine
+            said = failed or f"{str(verdict.get('verdict')).replace('_', ' ')} {named}".strip()
             kind = f"{label['kind']}, {'closed' if label['closed_loop'] else 'open'}"
             truth = " + ".join(label["truth"]) or "nothing"
             if wanted := label.get("findings"):
