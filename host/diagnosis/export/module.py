@@ -100,7 +100,8 @@ def _law(model: Any, theta: Array, active: list[ActiveEffect], gathered: Gathere
     if isinstance(model, TransmissionModel):
         return _links(model, theta, gathered), "none"
     if isinstance(model, AxisModel) and model.free_run and model.spec.controller is None:
-        return _axis(model, theta, active, gathered), "position and speed"
+        said = "position and speed; then those of a second mass from there, if the law has one"
+        return _axis(model, theta, active, gathered), said
     along = [c.key for c, _ in active if {"force", "chain"} & set(c.port.kind.split("+"))]
     if along:
         wanted = "effects at inputs and outputs, or a parameter that the simulator offers ([[offer]])"

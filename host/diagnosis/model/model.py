@@ -130,7 +130,7 @@ class Model(ABC):
 
     def begins_with(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> npt.NDArray[np.intp]:
         """Indices (k,) of the unknown states that `segment` begins with and that show in its outputs."""
-        return np.flatnonzero(segment.begin.spread if segment.begin is not None else ())
+        return np.zeros(0, dtype=np.intp) if segment.begin is None else np.flatnonzero(segment.begin.spread > 0.0)
 
     def passive(self, theta: Array, active: list[ActiveEffect]) -> bool:
         """Whether no part of the law, the active effects included, is a mass, damper or spring below zero."""

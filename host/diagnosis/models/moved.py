@@ -51,7 +51,8 @@ class Moved:
         least = (LEAST_WINDOW, DEGREE + 2 if clean else LEAST_WINDOW, DEGREE + 2)
         best = [widest] * 3
         if recording.timed and motion.size >= SHORTEST:
-            best = [least_error_window(motion, recording.dt_s, noise, DEGREE, order) for order in (0, 1, 2)]
+            used = (1, 2) if clean else (0, 1, 2)  # a clean position is taken as it is
+            best[-len(used) :] = [least_error_window(motion, recording.dt_s, noise, DEGREE, order) for order in used]
         windows = [max(min(one, widest), short) for one, short in zip(best, least, strict=True)]
         x, v, a = (smooth_derivatives(motion, recording.dt_s, one, DEGREE)[k] for k, one in enumerate(windows))
         # smoothing a clean motion would round its reversals, and friction with them

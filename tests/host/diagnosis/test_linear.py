@@ -343,7 +343,7 @@ def test_a_state_from_which_a_loop_runs_away_moves_less_or_not_at_all(reach: flo
         model = OneState()
 
         def parted(self, terms: Any, values: Any) -> tuple[Any, list[Any]]:
-            """Return no effects."""
+            """The values are nominal parameters alone: nothing acts."""
             return values, []
 
         def stacked(self, terms: Any, values: Any) -> Array:

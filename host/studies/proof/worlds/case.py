@@ -315,9 +315,9 @@ def _attempt(mechanism: Mechanism, plan: CasePlan) -> DrawnCase | None:
 def make(mechanisms: Sequence[Mechanism], plan: CasePlan) -> Case:
     """Return the case of `plan`, redrawn until its effect has the wanted size. Raises RuntimeError if none does.
 
-    A mechanism that gives none in ATTEMPTS draws is followed by the next one.
+    The first draw is that of the plan's attempt. A mechanism that gives none in ATTEMPTS draws is followed by the next one.
     """
-    for attempt in range(ATTEMPTS * len(mechanisms)):
+    for attempt in range(plan.attempt, ATTEMPTS * len(mechanisms)):
         number = (plan.mechanism + attempt // ATTEMPTS) % len(mechanisms)
         now = replace(plan, attempt=attempt, mechanism=number)
         drawn = _attempt(mechanisms[number], now)

@@ -129,8 +129,9 @@ class Gear(ode.Link):
         c, (time_s, lead), gain = setup.scales, _clock(setup, i), setup.parameters["gain"]
         wanted = c.motion * windows.command(setup, i, 0)(time_s)
         other = windows.command(setup, i, 1)(time_s)
-        load = self._torque(setup, planted) * windows.command(setup, i, 2)(time_s)
-        xml = self._xml(setup, planted)
+        pressed = windows.command(setup, i, 2)(time_s)
+        load = self._torque(setup, planted) * pressed
+        xml, pull = self._xml(setup, planted), self._pull(setup, planted)
         noise = np.repeat(setup.noise(i, "load_rad"), setup.style["every"])
         slow = [0.0]
 
@@ -141,7 +142,7 @@ class Gear(ode.Link):
                 slow[0] += 0.01 * ((gain * wanted[step] - data.qpos[1] - noise[at]) / gain - slow[0])
                 correction = 0.4 * slow[0]
             data.ctrl[0], data.ctrl[1] = wanted[step] + correction, load[step]
-            data.qfrc_applied[1] = self._pull(planted, setup, data, other[step], load[step])
+            data.qfrc_applied[1] = pull(data, other[step], pressed[step])
 
         out = simulate(xml, time_s.size, control, lambda data: (float(data.qpos[0]), float(data.qpos[1])))
         late = _only(planted, "latency").get("delay_s", 0.0)
@@ -155,26 +156,26 @@ class Gear(ode.Link):
         }
         return Trace(columns)
 
-    def _pull(self, planted: Sequence[Planted], setup: Setup, data: Any, other: float, load: float) -> float:
-        """Return the torque (N m) of a hanging mass, or of an effect outside the vocabulary, at the load behind its shaft.
+    def _pull(self, setup: Setup, planted: Sequence[Planted]) -> Callable[[Any, float, float], float]:
+        """Return the torque (N m) of a hanging mass, or of an effect outside the vocabulary, at the load behind its shaft: a
+        function of the engine's data, the other motor's command and the load's, both in units of their size.
 
         The mass hangs on an arm without length in the plane of rotation: as a body, it added up to 300 times the inertia of
         the load, a mode within the recording that no label named.
         """
-        hang, stiffness = _only(planted, "gravity_load"), self._stiffness(setup)
+        stiffness, hang = self._shaft(setup, planted), _only(planted, "gravity_load")
+        product = _only(planted, "stiffness that the other motor changes").get("size", 0.0)
+        ratio = _only(planted, "ratio that the load torque changes").get("size", 0.0)
         if hang:
-            moment = self._shaft(setup, planted) * hang["share"] * setup.parameters["gain"] * setup.scales.motion
-            return -moment * float(np.sin(data.qpos[1]))
-        product = _only(planted, "stiffness that the other motor changes")
-        if product:
-            return stiffness * product["size"] * float(data.qpos[1]) * other
-        ratio = _only(planted, "ratio that the load torque changes")
-        size = self._torque(setup, planted)
-        return stiffness * ratio["size"] * float(data.qpos[0]) * load / size if ratio else 0.0
+            moment = stiffness * hang["share"] * setup.parameters["gain"] * setup.scales.motion
+            return lambda data, other, pressed: -moment * float(np.sin(data.qpos[1]))
+        return lambda data, other, pressed: (
+            stiffness * (product * float(data.qpos[1]) * other + ratio * float(data.qpos[0]) * pressed)
+        )
 
     def _stiffness(self, setup: Setup) -> float:
         """Return the stiffness (N m/rad) of a shaft whose mode with the load lies far above the excitation."""
-        return 1e-3 * (12.0 / setup.scales.slow_s) ** 2
+        return LOAD_kg_m2 * (12.0 / setup.scales.slow_s) ** 2
 
     def _shaft(self, setup: Setup, planted: Sequence[Planted]) -> float:
         """Return the stiffness (N m/rad) between motor and load; 0 where they turn as one."""
@@ -206,7 +207,7 @@ class Gear(ode.Link):
         if stiffness and not mode:  # keep the load's own mode out of the recording
             inertia = min(inertia, stiffness * ((0.05 if soft else 0.02) * c.slow_s) ** 2)
         if gap:
-            friction, inertia = 4.0 * c.force + 20.0 * inertia * c.motion / c.slow_s**2, inertia
+            friction = 4.0 * c.force + 20.0 * inertia * c.motion / c.slow_s**2
         damping = 2.0 * 0.15 * (stiffness * inertia) ** 0.5
         poly = f"0 {gain} 0 {-bend * gain / c.motion**2} 0"
         rigid = (

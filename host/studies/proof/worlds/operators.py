@@ -1,8 +1,7 @@
 """What a signal becomes on a fine time grid: hysteresis, delay, creep and modes by formulas that the finder does not use.
 
-Play engages gradually, presliding is a Prandtl-Ishlinskii operator, creep a chain of Kelvin elements in
-logarithmic spacing, saturation an algebraic sigmoid. Every operator takes x (n,) on an even grid of step h (s) and returns
-(n,).
+Play engages gradually, presliding is a Prandtl-Ishlinskii operator, creep a chain of Kelvin elements in logarithmic
+spacing, saturation an algebraic sigmoid. Every operator takes x (n,) on an even grid, of step h (s), and returns (n,).
 """
 
 from __future__ import annotations
