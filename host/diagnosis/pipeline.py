@@ -55,6 +55,7 @@ from host.diagnosis.selection.remarks import (
     larger_than_noise,
     lines_in_spectrum,
     noise_of_motion,
+    not_explained,
     read_seldom,
     slow_noise,
     times_noise,
@@ -62,7 +63,7 @@ from host.diagnosis.selection.remarks import (
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
 from host.diagnosis.selection.search import concluded, forward, search
 from host.diagnosis.selection.trial import Trial, within_sample
-from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
+from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs, structured_outputs
 from host.diagnosis.selection.within_recordings import changed_within
 from protocol.errors import InputError
 
@@ -328,6 +329,9 @@ def _diagnosed(
         slow = slow_outputs(problem, found.best)
         late = any(finding.id == "within_sample" for finding in done.findings)  # it explains what exceeds the noise
         result.findings += slow_noise(full, fits, slow) or ([] if late else larger_than_noise(full, fits, figures))
+    known = between or any(finding.id in ("jump", "line") for finding in result.findings)
+    if result.verdict == "mismatch_not_identified" and not found.best.terms and not known:
+        result.findings += not_explained(full, fits, figures, structured_outputs(problem, found.best))
     if not located and remainder.sure and remainder.predicted is not None:
         result.located = [unexplained(full, fits, remainder.predicted.subsystem)]
     overall.end()

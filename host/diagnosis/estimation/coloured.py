@@ -9,15 +9,17 @@ an input. Each is tested on the innovations e of an autoregression of the residu
     lines:   the periodogram of e over its own level (Fisher's test: exponential under the hypothesis)
     inputs:  the coherence of e with inputs, their squares, magnitudes and directions (Welch; Carter 1987)
 
-The innovations of a slow wander say nothing of its shape. A residual with few independent samples counts as noise only if
-no structure is common to its recordings as well: averaged over parts of a correlation time, it is correlated with features
-of the inputs (the largest share of variance over all of them), with time, and between recordings. The limits come from
-simulated noise of the same correlation time, since few samples have chance correlations of any size (Yule 1926).
+The innovations of a slow wander say nothing of its shape. There the residual itself is compared with features of the
+inputs, with time, and between recordings (`structured`). Averaged over parts of a correlation time, the largest share of
+its variance that one feature takes is compared with that of surrogates: noise with the residual's own spectrum and random
+phases (Theiler et al., Physica D 1992). Few independent samples have chance correlations of any size (Yule 1926), and
+surrogates have as many. What nominal parameters absorb is removed from residual, features and surrogates alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -32,14 +34,21 @@ Array = npt.NDArray[np.float64]
 ORDER = 20  # of the autoregression
 LONGEST = 512  # samples of a part of a recording, of which at least
 PARTS = 16.0  # of an integrated correlation time (an eighth of the time constant) that a slow residual is averaged over
-SIMULATED = 999  # noises that a slow residual is compared with
+SURROGATES = 999  # noises that a residual is compared with
+MOST_PARTS = 8192  # of all recordings, that a residual is averaged over
+NOT_ABSORBED = 1e-4  # share of a feature's power that nominal parameters leave, at least
 PLAYS, LAGS = (0.1, 0.3, 0.6), (1 / 60, 1 / 20, 1 / 6)  # memories: widths over the span, times over the recording's length
 EARLIER = (2, 3, 5, 8, 13, 21, 34, 55, 89)  # samples by which a cause precedes; the speed reads one sample ahead
 AVERAGES = 8  # of a recording estimate a coherence: 1 - (p)^(1 / (parts - 1)) is exceeded by chance with p (Carter 1987)
 
 
-def only_coloured(residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], rules: SelectionRules) -> bool:
-    """Whether residuals (n_i,) of recordings are coloured noise that no input (n_i,) of its recording explains."""
+def only_coloured(
+    residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], rules: SelectionRules, absorbed: Sequence[Array] = ()
+) -> bool:
+    """Whether residuals (n_i,) of recordings are coloured noise that no input (n_i,) of its recording explains.
+
+    absorbed: (k, n_i) of each recording, what a change of each nominal parameter adds to the output.
+    """
     pairs = [(r, u) for r, u in zip(residuals, inputs, strict=True) if np.isfinite(r).sum() >= 20 * ORDER]
     if not pairs:
         return False
@@ -50,7 +59,7 @@ def only_coloured(residuals: Sequence[Array], inputs: Sequence[Sequence[Array]],
         return False
     if _follow(new, own, significance) and _caused(new, own, rules):
         return False
-    return not too_slow(residuals, rules) or not _common(lines, own, rules)
+    return not too_slow(residuals, rules) or not structured(residuals, inputs, absorbed, rules)
 
 
 def too_slow(residuals: Sequence[Array], rules: SelectionRules) -> bool:
@@ -63,53 +72,89 @@ def independent_samples(residuals: Sequence[Array]) -> float:
     return float(sum(np.isfinite(r).sum() / correlation_time(r - np.nanmean(r)) for r in residuals if np.isfinite(r).any()))
 
 
-def _common(lines: list[Array], inputs: Sequence[Sequence[Array]], rules: SelectionRules) -> bool:
-    """Whether slow residuals (n_i,) of recordings share a structure that noise of their correlation time hardly has."""
-    step = max(1, int(np.median([correlation_time(r) for r in lines]) / PARTS))
+def structured(
+    residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], absorbed: Sequence[Array], rules: SelectionRules
+) -> bool:
+    """Whether residuals (n_i,) of recordings have a structure that noise with their spectra hardly has.
+
+    An input (n_i,) that a controller computes from the output holds noise of the residual, and this is a structure too.
+    absorbed: (k, n_i) of each recording, what a change of each nominal parameter adds to the output.
+    """
+    long = [k for k, r in enumerate(residuals) if np.isfinite(r).sum() >= 20 * ORDER]
+    if not long:
+        return False
+    lines = [fill(residuals[k]) - np.nanmean(residuals[k]) for k in long]
+    step = int(np.median([correlation_time(r) for r in lines]) / PARTS)
+    step = max(1, step, -(-sum(r.size for r in lines) // MOST_PARTS))
     rows = [_averaged(r, step) for r in lines]
-    fade = _fade(rows)
-    tables = [_slow_features(u, step, len(rows)) for u in inputs]
+    tables = [_slow_features(inputs[k], step, len(rows)) for k in long]
     rng = np.random.default_rng(0)
-    noises = [_wander(rng, SIMULATED, r.size, fade) for r in rows]
-    of_inputs, by_inputs = _of_features([r[None, :] for r in rows], tables), _of_features(noises, tables)
-    usual = np.quantile(by_inputs, 0.95, axis=1, keepdims=True) + 1e-12  # features have unlike numbers of turns
-    tests = [(np.max(of_inputs / usual), np.max(by_inputs / usual, axis=0))] if tables[0] else []
+    noises = [_surrogates(rng, r) for r in rows]
+    tests = []
+    if tables[0]:
+        own = [[_averaged(fill(rate), step) for rate in absorbed[k]] for k in long] if absorbed else [[] for _ in long]
+        tests.append(_of_features(rows, noises, tables, own))
     if len(rows) > 1:
         tests.append((_of_each_other([r[None, :] for r in rows])[0], _of_each_other(noises)))
-    limit = rules.slow_structure_significance / max(len(tests), 1) * (SIMULATED + 1)
+    limit = rules.slow_structure_significance / max(len(tests), 1) * (SURROGATES + 1)
     return any(1 + np.count_nonzero(by_chance >= found) <= limit for found, by_chance in tests)
+
+
+def shifted(inputs: Sequence[Array]) -> Array:
+    """Inputs (n,) and each of them earlier and later by up to 89 samples, one a row: what a linear law makes of them."""
+    rows = []
+    for u in map(fill, inputs):
+        rows.append(u)
+        for k in EARLIER:
+            rows += [np.concatenate((np.full(k, u[0]), u[:-k])), np.concatenate((u[k:], np.full(k, u[-1])))]
+    return np.array(rows)
+
+
+def _surrogates(rng: np.random.Generator, row: Array) -> Array:
+    """Draws (SURROGATES, n) of noise with the spectrum of `row` (n,), whose mean is zero."""
+    size = np.abs(np.fft.rfft(row))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (SURROGATES, size.size))
+    return np.asarray(np.fft.irfft(size * np.exp(1j * phase), row.size, axis=1))
+
+
+def _of_features(
+    rows: list[Array], noises: list[Array], tables: list[list[Array]], absorbed: list[list[Array]]
+) -> tuple[float, Array]:
+    """Largest share of the variance that one feature takes, of the residual and of each surrogate (SURROGATES,).
+
+    Shares of a feature are relative to the one that a surrogate in twenty exceeds: features have unlike numbers of turns.
+    """
+    kept = _left_by([np.concatenate(rates) for rates in zip(*absorbed, strict=True)])
+    found, by_chance = kept(np.concatenate(rows)), kept(np.concatenate(noises, axis=1))
+    power, powers = float(found @ found) + 1e-300, np.sum(by_chance * by_chance, axis=1) + 1e-300
+    largest, largest_by_chance = 0.0, np.zeros(len(powers))
+    for parts in zip(*tables, strict=True):
+        whole = np.concatenate(parts)
+        feature = kept(whole)
+        size = float(feature @ feature)
+        if not size > NOT_ABSORBED * float(whole @ whole):
+            continue
+        shares = (by_chance @ feature) ** 2 / (size * powers)
+        usual = float(np.quantile(shares, 0.95)) + 1e-12
+        largest = max(largest, float(found @ feature) ** 2 / (size * power) / usual)
+        largest_by_chance = np.maximum(largest_by_chance, shares / usual)
+    return largest, largest_by_chance
+
+
+def _left_by(absorbed: list[Array]) -> Callable[[Array], Array]:
+    """Return rows (..., n) less all that a sum of `absorbed` (n,) explains."""
+    moving = [rate / np.linalg.norm(rate) for rate in absorbed if np.isfinite(rate).all() and np.ptp(rate) > 0.0]
+    if not moving:
+        return lambda rows: rows
+    directions, sizes, _ = np.linalg.svd(np.column_stack(moving), full_matrices=False)
+    basis = directions[:, sizes > 1e-6 * sizes[0]]
+    return lambda rows: np.asarray(rows - (rows @ basis) @ basis.T)
 
 
 def _averaged(x: Array, step: int) -> Array:
     """`x` (n,) averaged over parts of `step` samples, less its mean."""
     parts = x[: x.size // step * step].reshape(-1, step).mean(axis=1)
     return np.asarray(parts - np.mean(parts))
-
-
-def _fade(rows: list[Array]) -> float:
-    """Correlation of neighbours of a first-order process, less the bias of short records (Kendall 1954)."""
-    a = sum(float(r[1:] @ r[:-1]) for r in rows) / (sum(float(r @ r) for r in rows) + 1e-300)
-    n = float(np.mean([r.size for r in rows]))
-    return float(np.clip(a + (1.0 + 4.0 * a) / n, 0.0, 1.0 - 1.0 / n))
-
-
-def _wander(rng: np.random.Generator, count: int, n: int, fade: float) -> Array:
-    """Draws (count, n) of a stationary first-order process of unit variance, each less its mean."""
-    out = np.empty((count, n))
-    out[:, 0] = rng.standard_normal(count)
-    for k in range(1, n):
-        out[:, k] = fade * out[:, k - 1] + np.sqrt(1.0 - fade**2) * rng.standard_normal(count)
-    return out - out.mean(axis=1, keepdims=True)
-
-
-def _of_features(rows: list[Array], tables: list[list[Array]]) -> Array:
-    """Share (features, count) of the variance of draws (count, n_i) that a feature takes with one coefficient in all."""
-    power = sum(np.sum(r * r, axis=1) for r in rows) + 1e-300
-    shares = []
-    for feature in zip(*tables, strict=True):
-        size = sum(float(f @ f) for f in feature) + 1e-300
-        shares.append(sum(r @ f for r, f in zip(rows, feature, strict=True)) ** 2 / (size * power))
-    return np.array(shares)
 
 
 def _of_each_other(rows: list[Array]) -> Array:
@@ -129,6 +174,9 @@ def _slow_features(inputs: Sequence[Array], step: int, recordings: int) -> list[
         table += [play(u, 0.5 * width * float(np.ptp(u)), 0.0) - u for width in PLAYS]
         table += [lag(u, 1.0, share * u.size) - u for share in LAGS]
     table += [a * b for k, a in enumerate(filled) for b in filled[k + 1 :]]
+    for a, b in itertools.product(filled, repeat=2):  # forces that go with one place and with another speed
+        speed = np.gradient(b)
+        table += [a * speed, a * np.abs(speed), a * a * speed, np.abs(a) * np.sign(speed)]
     if recordings > 1 and filled:
         table.append(np.arange(filled[0].size, dtype=float))
     return [_averaged(feature, step) for feature in table]

@@ -24,6 +24,7 @@ FAR = 1e6  # residual, in units of noise, at which those of a fit are cut
 LARGEST_AMPLITUDE = 1000.0  # of an effect, in natural sizes
 BEGIN = "begin:"  # key of a state that a recording begins from, among its starts of memory
 WAIT = 1.3  # of a dead time's start value: so much of a recording is left out while it is fitted
+RATE_STEP = 1e-3  # of a parameter in its own scale, for differences
 MODE_LINES = 3  # highest lines of the residual at which a mode is tried, before its grid
 
 
@@ -287,7 +288,7 @@ def jacobian(problem: Problem, terms: tuple[Term, ...], values: Array, base: Arr
     columns = []
     for index in free(parameters):
         p = parameters[index]
-        step = 1e-3 if p.log else 1e-3 * sizes[index]
+        step = RATE_STEP if p.log else RATE_STEP * sizes[index]
         moved = values.copy()
         up = values[index] * (1.0 + step) if p.log else values[index] + step
         down = values[index] * (1.0 - step) if p.log else values[index] - step
@@ -295,6 +296,18 @@ def jacobian(problem: Problem, terms: tuple[Term, ...], values: Array, base: Arr
         by = (moved[index] / values[index] - 1.0) if p.log else (moved[index] - values[index]) / sizes[index]
         columns.append((base - problem.stacked(terms, moved)) / by)
     return np.array(columns).T if columns else np.zeros((base.size, 0))
+
+
+def parameter_rates(problem: Problem, fit: Fit, segment: Segment) -> Array:
+    """Change (k, outputs, n) of what `fit` simulates of a recording, per step of each free nominal parameter."""
+    base, rates = problem.simulate(segment, fit.terms, fit.values), []
+    for index in free(list(problem.model.parameters)):
+        p, values = problem.model.parameters[index], fit.values.copy()
+        step = RATE_STEP * (abs(values[index]) if p.log else size_of(p, values[index]))
+        values[index] += step if values[index] + step <= p.high else -step
+        by = (values[index] - fit.values[index]) / step
+        rates.append((problem.simulate(segment, fit.terms, values) - base) / by)
+    return np.array(rates) if rates else np.zeros((0, *base.shape))
 
 
 def robust(r: Array) -> tuple[float, Array]:

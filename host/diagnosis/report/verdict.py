@@ -38,6 +38,7 @@ REMARKS = (
     "repeated",
     "session",
     "changed",
+    "unexplained",
     *UNDECIDED,
 )  # findings that ask for no change of the data
 

@@ -123,6 +123,28 @@ def times_noise(full: Problem, fits: FullRate, figures: Figures) -> Array:
     return np.asarray(left / np.maximum(full.noise_sd, 1e-300))
 
 
+def not_explained(full: Problem, fits: FullRate, figures: Figures, structured: list[int]) -> list[Finding]:
+    """Sentences on outputs whose residual is larger than the noise, where a mismatch is certain and no effect explains it.
+
+    structured: rows of outputs whose residual follows inputs or repeats, as hardly any noise does.
+    """
+    findings, rules = [], full.rules
+    for row, ratio in enumerate(times_noise(full, fits, figures)):
+        if not ratio > rules.residual_over_noise:
+            continue
+        output, noise = full.model.outputs[row], full.noise[row]
+        column = full.columns.get(output.channel, output.channel)
+        says = (
+            f"The residual of column {column}, {ratio * noise.sigma:.3g} {output.unit} RMS, is {ratio:.2g} times the noise "
+        )
+        says += "that was recorded alone" if noise.source.seen_alone else "that its spectrum suggests"
+        if row in structured:
+            kept = 100.0 * (1.0 - rules.slow_structure_significance)
+            says += f", and follows the inputs, or time, more closely than {kept:.3g} % of noises with its spectrum"
+        findings.append(Finding("unexplained", column, says + ". No known effect explains it."))
+    return findings
+
+
 def larger_than_noise(full: Problem, fits: FullRate, figures: Figures) -> list[Finding]:
     """Sentences on outputs whose residual is larger than the noise, and not surely so."""
     findings, rules = [], full.rules

@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.coloured import only_coloured, too_slow
+from host.diagnosis.estimation.coloured import only_coloured, shifted, structured, too_slow
 from host.diagnosis.estimation.evidence import asked
-from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, reweigh, set_starts
+from host.diagnosis.estimation.feedback import later_share
+from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, parameter_rates, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
+from host.diagnosis.estimation.noise import NoiseSource
 from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.refits import fit_without, try_fit
@@ -64,16 +66,58 @@ def _above_noise(problem: Problem, found: Found) -> bool:
     """Whether the best model leaves more than the noise of some output can be: noise known from quiescent parts, or
     guessed. What the fitted samples leave counts, too: held-out ones may hardly show what is missing.
     """
-    measured = problem.rules.residual_over_noise if found.best.terms else problem.rules.residual_over_noise_nominal
-    noise_sd = _levels(problem, found.best)
-    return any(
-        max(_power(problem, found.best.residuals, row), _power(problem, found.best.residuals, row, "both"))
-        > ((measured if noise.source.seen_alone else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
-        or (
-            not found.best.terms and bool(jumps_of([r[row] for r in found.best.residuals], problem.rules))
-        )  # no noise does that
-        for row, noise in enumerate(problem.noise)
-    )
+    rules, levels, none = problem.rules, _levels(problem, found.best), not found.best.terms
+    measured = rules.residual_over_noise_nominal if none else rules.residual_over_noise
+    for row, noise in enumerate(problem.noise):
+        power = max(_power(problem, found.best.residuals, row), _power(problem, found.best.residuals, row, "both"))
+        left = float(np.sqrt(power))
+        if left > (measured if noise.source.seen_alone else rules.residual_over_guessed_noise) * levels[row]:
+            return True
+        if none and jumps_of([r[row] for r in found.best.residuals], rules):
+            return True  # no noise does that
+    return none and bool(structured_outputs(problem, found.best))
+
+
+def structured_outputs(problem: Problem, fit: Fit) -> list[int]:
+    """Rows of outputs of which `fit` leaves more than noise may be, if the guess is right, and not like any noise."""
+    least = problem.rules.residual_over_noise_nominal * problem.noise_sd
+    return [
+        row
+        for row in range(least.size)
+        if max(_power(problem, fit.residuals, row), _power(problem, fit.residuals, row, "both")) > least[row] ** 2
+        and _shows_structure(problem, fit, row)
+    ]
+
+
+def _shows_structure(problem: Problem, fit: Fit, row: int) -> bool:
+    """Whether the residual of an output follows something more than noise with its spectrum may do.
+
+    Noise of an input does so too: nothing is said of it. A controller feeds noise into an input by a linear law: where later
+    input says something of the residual, all that a linear law makes of the inputs is removed before.
+    """
+    rules, inputs = problem.rules, problem.model.quiet_inputs
+    if problem.noise[row].source is not NoiseSource.SPECTRUM or problem.noise_passed > rules.noise_passed_share:
+        return False
+    absorbed = _absorbed(problem, fit, row)
+    if not later_share(problem.segments, fit.residuals, row, inputs, rules) < rules.feedback_share:
+        filtered = [shifted([segment.inputs[name] for name in inputs]) for segment in problem.segments]
+        absorbed = [np.vstack(both) for both in zip(absorbed, filtered, strict=True)]
+    return structured([r[row] for r in fit.residuals], _known(problem, fit), absorbed, rules)
+
+
+def _known(problem: Problem, fit: Fit) -> list[list[Array]]:
+    """Signals (n_i,) of each recording that a mismatch may follow: inputs and simulated outputs.
+
+    What a plant does to a force inside it follows its own motion, of which no form of an input says enough.
+    """
+    return [
+        [*(segment.inputs[name] for name in problem.model.quiet_inputs), *(segment.y - r)]
+        for segment, r in zip(problem.segments, fit.residuals, strict=True)
+    ]
+
+
+def _absorbed(problem: Problem, fit: Fit, row: int) -> list[Array]:
+    return [parameter_rates(problem, fit, segment)[:, row] for segment in problem.segments]
 
 
 def _levels(problem: Problem, fit: Fit) -> Array:
@@ -81,12 +125,8 @@ def _levels(problem: Problem, fit: Fit) -> Array:
     levels = problem.noise_sd
     for row, noise in enumerate(problem.noise):
         if not noise.source.seen_alone and _power(problem, fit.residuals, row) > levels[row] ** 2:
-            # What a plant does to a force inside it follows its own motion, of which no form of an input says enough.
-            known = [
-                [*(segment.inputs[name] for name in problem.model.quiet_inputs), segment.y[row] - r[row]]
-                for segment, r in zip(problem.segments, fit.residuals, strict=True)
-            ]
-            if only_coloured([r[row] for r in fit.residuals], known, problem.rules):
+            residuals = [r[row] for r in fit.residuals]
+            if only_coloured(residuals, _known(problem, fit), problem.rules, _absorbed(problem, fit, row)):
                 levels[row] = np.sqrt(_power(problem, fit.residuals, row))
     return levels
 

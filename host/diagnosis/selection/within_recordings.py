@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.fit import FAR, Fit, Problem, free, size_of
+from host.diagnosis.estimation.fit import FAR, Fit, Problem, free, parameter_rates
 from host.diagnosis.model.dataset import Recording, parted
 from host.diagnosis.model.readings import Finding
 from host.diagnosis.selection.between_recordings import Apart, Inadequate, fitted_alone, root_mean_square
@@ -17,7 +17,6 @@ from host.diagnosis.selection.refits import fit_nominal, refined
 Array = npt.NDArray[np.float64]
 Prepared = Callable[[list[Recording]], Problem]
 INSTANTS = 200  # at which a change is tried in one recording
-STEP = 1e-3  # of a parameter in its own scale, for differences
 FIRST_MARGIN, LAST_MARGIN = 0.05, 0.01  # of a recording, left out before and behind the instant as long as it is not exact
 FAR_VARIANCE = 4.0  # squared residual of the part before, over the noise: more speaks for a sample behind the change
 
@@ -49,7 +48,7 @@ def changed_within(
     long = [k for k, segment in enumerate(problem.segments) if segment.n > 2 * least + 2]
     if not moving or not long:
         return []
-    change = max((_likeliest(problem, nominal, k, moving, least) for k in long), key=lambda found: found.reduction)
+    change = max((_likeliest(problem, nominal, k, least) for k in long), key=lambda found: found.reduction)
     whole = recordings[change.number]
     parts = _parts(problem, whole, change, FIRST_MARGIN)
     if parts:
@@ -72,20 +71,14 @@ def changed_within(
     return [Finding("changed", problem.columns.get(output.channel, output.channel), says)]
 
 
-def _likeliest(problem: Problem, nominal: Fit, number: int, moving: list[int], least: int) -> ParameterChange:
+def _likeliest(problem: Problem, nominal: Fit, number: int, least: int) -> ParameterChange:
     """The instant in one recording at which a change of the parameters removes most of the residual, to first order.
 
     least: samples before and behind it.
     """
     segment = problem.segments[number]
     base = problem.left(segment, (), nominal.values) / problem.scale[:, None]
-    columns = []
-    for index in moving:
-        p, values = problem.model.parameters[index], nominal.values.copy()
-        step = STEP * (abs(values[index]) if p.log else size_of(p, values[index]))
-        values[index] += step if values[index] + step <= p.high else -step
-        by = (values[index] - nominal.values[index]) / step
-        columns.append((base - problem.left(segment, (), values) / problem.scale[:, None]) / by)
+    columns = parameter_rates(problem, nominal, segment) / problem.scale[:, None]
     seen = np.all(np.abs([base, *columns]) < FAR, axis=0)  # a simulation may run away
     residual, rates = np.where(seen, base, 0.0), np.where(seen, columns, 0.0)
     squares = np.cumsum(np.einsum("ikn,jkn->nij", rates, rates), axis=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from scipy import signal
 
 import seldinger as sd
-from host.diagnosis.estimation.coloured import only_coloured, too_slow
+from host.diagnosis.estimation.coloured import only_coloured, structured, too_slow
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.rules import RULES
@@ -175,10 +176,10 @@ def wandering(seed: int) -> list[dict[str, Array]]:
     return recordings
 
 
-FALSE_ALARM = pytest.mark.xfail(strict=True, reason="false alarm in 2 of 8 draws: mismatch_not_identified")
+FALSE_ALARM = pytest.mark.xfail(strict=True, reason="false alarm in 1 of 8 draws: mismatch_not_identified")
 
 
-@pytest.mark.parametrize("seed", [pytest.param(k, marks=FALSE_ALARM) if k in (3, 6) else k for k in range(8)])
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=FALSE_ALARM) if k == 6 else k for k in range(8)])
 def test_noise_too_slow_to_be_told_from_a_mismatch_is_no_alarm(seed: int) -> None:
     assert sd.diagnose(wandering(seed), LINK).verdict == "nothing_missing"
 
@@ -367,3 +368,29 @@ def test_a_further_effect_is_not_named_where_it_is_improbable() -> None:
         recordings.append({"t": fine[::10], "x": x[::10], "y": late[::10] + 0.007 * rng.standard_normal(fine[::10].size)})
     named = {effect["id"]: effect["probability"] for effect in sd.diagnose(recordings, LINK).effects}
     assert len(named) == 1 or min(named.values()) >= 0.5
+
+
+def half_slow(seed: int, n: int) -> Array:
+    """White noise, and as much that is correlated over 30 samples."""
+    return np.random.default_rng([149, seed]).standard_normal(n) + wander(seed, n, 30.0)
+
+
+@pytest.mark.parametrize("noise", [half_slow, lambda seed, n: wander(seed, n, 150.0), shaken], ids=["half", "slow", "floor"])
+def test_noise_has_no_structure(noise: Callable[[int, int], Array]) -> None:
+    """Of 50 draws one may look like a structure at the 1 % that the rules allow; two are exceeded once in 70 times."""
+    found = 0
+    for seed in range(50):
+        inputs = [[sway(2 * seed + k, np.arange(800) * 0.05, 0.4, 0.25)] for k in range(2)]
+        absorbed = [np.array([u[0], np.gradient(u[0])]) for u in inputs]
+        found += structured([noise(2 * seed + k, 800) for k in range(2)], inputs, absorbed, RULES)
+    assert found <= 2
+
+
+def test_a_structure_is_seen_behind_what_nominal_parameters_absorb() -> None:
+    """Friction along a slow motion looks like damping: the fitted damping takes 88 % of its power."""
+    inputs = [[sway(k, np.arange(800) * 0.05, 0.2, 0.25)] for k in (41, 42)]
+    rates = [np.array([u[0], np.gradient(u[0])]) for u in inputs]
+    friction = [np.tanh(np.gradient(u[0]) / 0.01) for u in inputs]
+    gains = np.linalg.lstsq(np.hstack(rates).T, np.concatenate(friction), rcond=None)[0]
+    left = [f - gains @ rate + 0.03 * half_slow(k, 800) for k, (f, rate) in enumerate(zip(friction, rates, strict=True))]
+    assert structured(left, inputs, rates, RULES)

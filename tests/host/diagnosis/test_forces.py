@@ -84,6 +84,18 @@ def test_an_arm_that_lacks_nothing_has_nothing_named() -> None:
     assert (verdict.verdict, verdict.effects) == ("nothing_missing", [])
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_law_outside_the_vocabulary_is_flagged_in_short_recordings(seed: int) -> None:
+    """Friction of the elbow that goes with the shoulder's torque; it is slow, and noise was never recorded alone."""
+    recordings = [recorded(10 * seed + k, seconds=4.0) for k in range(2)]
+    for r in recordings:
+        r["elbow_Nm"] += 0.05 * np.abs(r["shoulder_Nm"]) * np.tanh(np.gradient(r["elbow_rad"], PERIOD_S) / 0.1)
+    verdict = sd.diagnose(recordings, nominal())
+    assert (verdict.verdict, verdict.effects) == ("mismatch_not_identified", [])
+    (finding,) = [finding for finding in verdict.data_findings if finding["id"] == "unexplained"]
+    assert finding["channel"] == "elbow_Nm" and "noises with its spectrum" in finding["says"]
+
+
 def test_torques_of_a_payload_are_those_of_the_composite_link() -> None:
     with_load, without = (recorded(1, links, seconds=2.0) for links in (carrying(0.1, 0.25), LINKS))
     rows = []
