@@ -7,11 +7,17 @@ import numpy as np
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 from host.diagnosis.model.operators import play
 
+COARSE = 2e-3  # of the travel: least movement that counts, from which it is one of the reading's steps
+
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Return the width of the gap, in the motion's unit."""
-    low = max(s.tolerance, 1e-4 * s.span)
-    return (Parameter("width", s.unit, spread(max(low, 4e-3 * s.span), 0.6 * s.span, 10), low, 2.0 * s.span, log=True),)
+    """Return the width of the gap, in the motion's unit.
+
+    A gap that is much smaller than the travel counts where the motion is smooth. Of a motion that is read in coarse steps,
+    it would take single steps away.
+    """
+    low = s.tolerance if s.tolerance > COARSE * s.span else 1e-4 * s.span
+    return (Parameter("width", s.unit, spread(max(low, 3e-4 * s.span), 0.6 * s.span, 14), low, 2.0 * s.span, log=True),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

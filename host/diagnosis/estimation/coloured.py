@@ -261,6 +261,8 @@ def _caused(new: list[Array], inputs: Sequence[Sequence[Array]], rules: Selectio
     explained = y - X @ np.linalg.lstsq(X, y, rcond=1e-9)[0]
     m = int(np.linalg.matrix_rank(X, rtol=1e-9))
     free = y.size - m - len(new)
+    if free <= 0:
+        return False  # more forms than samples say nothing
     ratio = (float(y @ y) - float(explained @ explained)) / m / (float(explained @ explained) / free + 1e-300)
     return bool(fisher.sf(ratio, m, free) < rules.coloured_significance)
 

@@ -100,17 +100,6 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
     return noisy
 
 
-def later_share(
-    segments: list[Segment], residuals: list[Array], row: int, inputs: tuple[str, ...], rules: SelectionRules
-) -> float:
-    """Share of the variance of the residuals (outputs, n) of an output that later new input says, less what chance says.
-
-    NaN where no recording has samples enough to say so.
-    """
-    after = [_later(_new_input(segment, inputs, rules), HELD) for segment in segments]
-    return _share(after, residuals, row) if any(basis is not None for basis in after) else float("nan")
-
-
 def _at_once(
     segments: list[Segment], residuals: list[Array], row: int, name: str, least: float | None, rules: SelectionRules
 ) -> list[tuple[int, Array]]:

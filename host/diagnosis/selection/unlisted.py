@@ -11,11 +11,12 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.coloured import only_coloured, shifted, structured, too_slow
 from host.diagnosis.estimation.evidence import asked
-from host.diagnosis.estimation.feedback import later_share
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, parameter_rates, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.noise import NoiseSource
 from host.diagnosis.model.effect import Port
+from host.diagnosis.model.model import tolerance_of
+from host.diagnosis.model.operators import fill
 from host.diagnosis.selection.found import Found, SearchMove, Step
 from host.diagnosis.selection.refits import fit_without, try_fit
 from host.diagnosis.selection.screening import Screened, term_of
@@ -92,26 +93,41 @@ def structured_outputs(problem: Problem, fit: Fit) -> list[int]:
 def _shows_structure(problem: Problem, fit: Fit, row: int) -> bool:
     """Whether the residual of an output follows something more than noise with its spectrum may do.
 
-    Noise of an input does so too: nothing is said of it. A controller feeds noise into an input by a linear law: where later
-    input says something of the residual, all that a linear law makes of the inputs is removed before.
+    Noise of an input does so too, whether it was read with the input or a controller fed it into it. Both get there by a
+    linear law, so all that a linear law makes of the inputs is removed before.
     """
     rules, inputs = problem.rules, problem.model.quiet_inputs
     if problem.noise[row].source is not NoiseSource.SPECTRUM or problem.noise_passed > rules.noise_passed_share:
         return False
-    absorbed = _absorbed(problem, fit, row)
-    if not later_share(problem.segments, fit.residuals, row, inputs, rules) < rules.feedback_share:
-        filtered = [shifted([segment.inputs[name] for name in inputs]) for segment in problem.segments]
-        absorbed = [np.vstack(both) for both in zip(absorbed, filtered, strict=True)]
-    return structured([r[row] for r in fit.residuals], _known(problem, fit), absorbed, rules)
+    if _made_by_steps(problem, fit, row):
+        return False
+    filtered = [shifted([segment.inputs[name] for name in inputs]) for segment in problem.segments]
+    absorbed = [np.vstack(both) for both in zip(_absorbed(problem, fit, row), filtered, strict=True)]
+    return structured([r[row] for r in fit.residuals], _known(problem, fit, slice(None)), absorbed, rules)
 
 
-def _known(problem: Problem, fit: Fit) -> list[list[Array]]:
-    """Signals (n_i,) of each recording that a mismatch may follow: inputs and simulated outputs.
+def _made_by_steps(problem: Problem, fit: Fit, row: int) -> bool:
+    """Whether the steps in which an input is read may make the residual of an output, both relative to their signals.
+
+    Steps that are too fine to be seen are taken for a third of the least movement that counts.
+    """
+    left = float(np.sqrt(_power(problem, fit.residuals, row, "both")))
+    signal = float(np.nanstd(np.concatenate([segment.y[row] for segment in problem.segments])))
+    for name in problem.model.quiet_inputs:
+        u = [fill(segment.inputs[name]) for segment in problem.segments]
+        rounding = max(tolerance_of(x, float(np.ptp(x))) for x in u) / (3.0 * np.sqrt(12.0))
+        if left * float(np.std(np.concatenate(u))) < problem.rules.residual_over_noise_nominal * rounding * signal:
+            return True
+    return False
+
+
+def _known(problem: Problem, fit: Fit, row: int | slice) -> list[list[Array]]:
+    """Signals (n_i,) of each recording that a mismatch may follow: inputs, and simulated outputs (of a row, or of several).
 
     What a plant does to a force inside it follows its own motion, of which no form of an input says enough.
     """
     return [
-        [*(segment.inputs[name] for name in problem.model.quiet_inputs), *(segment.y - r)]
+        [*(segment.inputs[name] for name in problem.model.quiet_inputs), *np.atleast_2d(segment.y[row] - r[row])]
         for segment, r in zip(problem.segments, fit.residuals, strict=True)
     ]
 
@@ -126,7 +142,7 @@ def _levels(problem: Problem, fit: Fit) -> Array:
     for row, noise in enumerate(problem.noise):
         if not noise.source.seen_alone and _power(problem, fit.residuals, row) > levels[row] ** 2:
             residuals = [r[row] for r in fit.residuals]
-            if only_coloured(residuals, _known(problem, fit), problem.rules, _absorbed(problem, fit, row)):
+            if only_coloured(residuals, _known(problem, fit, row), problem.rules, _absorbed(problem, fit, row)):
                 levels[row] = np.sqrt(_power(problem, fit.residuals, row))
     return levels
 

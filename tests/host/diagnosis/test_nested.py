@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import seldinger as sd
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import diagnose
 from host.diagnosis.report.verdict import as_json
 from tests.host.diagnosis import planted
+from tests.host.diagnosis.test_examined import LINK, sway
 
 
 def backlash(x: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -65,3 +67,32 @@ def test_each_of_a_pair_is_told_from_the_other(tmp_path: Path, effect) -> None: 
         np.savetxt(path, np.column_stack((t, motor, load, tip)), delimiter=",", header="t,motor,load,tip", comments="")
     found = as_json(diagnose(read_nominal(nominal), files, lambda what, part: None), 0.0)["effects"]
     assert [e["id"] for e in found] == [effect.__name__ + ("_friction" if effect is presliding else "")]
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_gap_far_smaller_than_the_travel_is_backlash(seed: int) -> None:
+    """0.06 % of the travel, in noise of 0.7 of the gap: named dry or presliding friction where no width began so small."""
+    recordings = []
+    for k in range(3):
+        rng, t = np.random.default_rng([7, seed, k]), np.arange(0.0, 30.0, 0.01)
+        x = sway(10 * seed + k, t, 0.5, 0.25)
+        width = 6e-4 * float(np.ptp(x))
+        y = x.copy()
+        for i in range(1, x.size):
+            y[i] = min(max(y[i - 1], x[i] - width / 2), x[i] + width / 2)
+        recordings.append({"t": t, "x": x, "y": y + 0.7 * width * rng.standard_normal(t.size)})
+    (effect,) = sd.diagnose(recordings, LINK).effects
+    assert effect["id"] == "backlash"
+    assert effect["parameters"]["width_m"]["value"] == pytest.approx(width, rel=0.05)
+
+
+@pytest.mark.parametrize("step", [3e-4, 1e-3])
+def test_an_input_that_is_read_in_steps_lacks_no_physics(step: float) -> None:
+    """Steps of this share of the travel, which make three times the noise of the output."""
+    recordings = []
+    for k in range(3):
+        rng, t = np.random.default_rng([7, 1, k]), np.arange(0.0, 30.0, 0.01)
+        x = sway(10 + k, t, 0.5, 0.25)
+        size = step * float(np.ptp(x))
+        recordings.append({"t": t, "x": np.round(x / size) * size, "y": x + 0.1 * size * rng.standard_normal(t.size)})
+    assert sd.diagnose(recordings, LINK).verdict == "nothing_missing"
