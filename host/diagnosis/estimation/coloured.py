@@ -43,11 +43,15 @@ AVERAGES = 8  # of a recording estimate a coherence: 1 - (p)^(1 / (parts - 1)) i
 
 
 def only_coloured(
-    residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], rules: SelectionRules, absorbed: Sequence[Array] = ()
+    residuals: Sequence[Array],
+    inputs: Sequence[Sequence[Array]],
+    rules: SelectionRules,
+    absorbed: Callable[[], Sequence[Array]] = tuple,
 ) -> bool:
     """Whether residuals (n_i,) of recordings are coloured noise that no input (n_i,) of its recording explains.
 
-    absorbed: (k, n_i) of each recording, what a change of each nominal parameter adds to the output.
+    absorbed: gives (k, n_i) of each recording, what a change of each nominal parameter adds to the output. It is asked where
+    a residual is slow, since it costs simulations.
     """
     pairs = [(r, u) for r, u in zip(residuals, inputs, strict=True) if np.isfinite(r).sum() >= 20 * ORDER]
     if not pairs:
@@ -59,7 +63,7 @@ def only_coloured(
         return False
     if _follow(new, own, significance) and _caused(new, own, rules):
         return False
-    return not too_slow(residuals, rules) or not structured(residuals, inputs, absorbed, rules)
+    return not too_slow(residuals, rules) or not structured(residuals, inputs, absorbed(), rules)
 
 
 def too_slow(residuals: Sequence[Array], rules: SelectionRules) -> bool:

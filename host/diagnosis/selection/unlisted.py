@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -70,8 +71,7 @@ def _above_noise(problem: Problem, found: Found) -> bool:
     rules, levels, none = problem.rules, _levels(problem, found.best), not found.best.terms
     measured = rules.residual_over_noise_nominal if none else rules.residual_over_noise
     for row, noise in enumerate(problem.noise):
-        power = max(_power(problem, found.best.residuals, row), _power(problem, found.best.residuals, row, "both"))
-        left = float(np.sqrt(power))
+        left = _most_left(problem, found.best, row)
         if left > (measured if noise.source.seen_alone else rules.residual_over_guessed_noise) * levels[row]:
             return True
         if none and jumps_of([r[row] for r in found.best.residuals], rules):
@@ -84,9 +84,8 @@ def structured_outputs(problem: Problem, fit: Fit) -> list[int]:
     least = problem.rules.residual_over_noise_nominal * problem.noise_sd
     return [
         row
-        for row in range(least.size)
-        if max(_power(problem, fit.residuals, row), _power(problem, fit.residuals, row, "both")) > least[row] ** 2
-        and _shows_structure(problem, fit, row)
+        for row, level in enumerate(least)
+        if _most_left(problem, fit, row) > level and _shows_structure(problem, fit, row)
     ]
 
 
@@ -142,7 +141,7 @@ def _levels(problem: Problem, fit: Fit) -> Array:
     for row, noise in enumerate(problem.noise):
         if not noise.source.seen_alone and _power(problem, fit.residuals, row) > levels[row] ** 2:
             residuals = [r[row] for r in fit.residuals]
-            if only_coloured(residuals, _known(problem, fit, row), problem.rules, _absorbed(problem, fit, row)):
+            if only_coloured(residuals, _known(problem, fit, row), problem.rules, partial(_absorbed, problem, fit, row)):
                 levels[row] = np.sqrt(_power(problem, fit.residuals, row))
     return levels
 
@@ -155,6 +154,11 @@ def slow_outputs(problem: Problem, fit: Fit) -> list[int]:
         for row, sigma in enumerate(problem.noise_sd)
         if levels[row] > rules.residual_over_guessed_noise * sigma and too_slow([r[row] for r in fit.residuals], rules)
     ]
+
+
+def _most_left(problem: Problem, fit: Fit, row: int) -> float:
+    """RMS that `fit` leaves of an output, in held-out samples or in all, whichever is larger."""
+    return float(np.sqrt(max(_power(problem, fit.residuals, row, which) for which in ("heldout", "both"))))
 
 
 def _power(problem: Problem, residuals: list[Array], row: int, which: str = "heldout") -> float:
