@@ -48,7 +48,7 @@ def prove(
     from host.studies.proof import workers
     from host.studies.proof.runner import Settings, is_spent
     from host.studies.proof.runner import prove as run
-    from host.studies.proof.table import markdown, worlds_markdown
+    from host.studies.proof.table import Share, markdown, worlds_markdown
 
     within("--cases", cases, 1, 1_000_000)
     processes = checked_jobs(jobs)
@@ -80,7 +80,9 @@ def prove(
     if chosen == ("own",):
         print(markdown(result["table"], result["baselines"]))
     else:
-        print(worlds_markdown({name: each["table"] for name, each in result["worlds"].items()}, "own"))
+        tables = {name: each["table"] for name, each in result["worlds"].items()}
+        counted = {name: {k: Share(**v) for k, v in each["shares"].items()} for name, each in result["worlds"].items()}
+        print(worlds_markdown(tables, counted, "own"))
 
 
 def _calibration(path: Path | None) -> Any:

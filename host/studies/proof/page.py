@@ -35,7 +35,7 @@ def block(run: Path, others: Sequence[Path]) -> str:
     stopped = f" The run was stopped before its end: {', '.join(short)} have a verdict." if short else ""
     parts = [
         f"Seed {note['seed']}, {note['cases']} cases of each world.{stopped} As the finder states its probabilities:",
-        table.worlds_markdown({w: table.tabulate(f) for w, f in stated.items()}, OWN),
+        _table(stated),
     ]
     used = stated
     if others:
@@ -43,10 +43,15 @@ def block(run: Path, others: Sequence[Path]) -> str:
         seeds = ", ".join(str(json.loads((o / "suite.json").read_text(encoding="utf-8"))["seed"]) for o in others)
         parts += [
             f"Leaving one world out: each world with probabilities calibrated on the other worlds of seed {seeds}:",
-            table.worlds_markdown({w: table.tabulate(f) for w, f in used.items()}, OWN),
+            _table(used),
         ]
     parts += [_reliability(used), "Cases that were not right:", _failures(run)]
     return "\n\n".join(parts)
+
+
+def _table(facts: dict[str, list[Facts]]) -> str:
+    tables = {world: table.tabulate(found) for world, found in facts.items()}
+    return table.worlds_markdown(tables, {world: table.shares(found) for world, found in facts.items()}, OWN)
 
 
 def _reliability(facts: dict[str, list[Facts]]) -> str:
@@ -62,9 +67,8 @@ def together(runs: Sequence[Path]) -> str:
         for world in note["worlds"]:
             facts.setdefault(world, []).extend(scored(run, world, as_stated))
     counts = ", ".join(f"{len(found)} cases of {world}" for world, found in facts.items())
-    tables = {world: table.tabulate(found) for world, found in facts.items()}
     title = f"Seeds {' and '.join(dict.fromkeys(str(note['seed']) for note in notes))} together, {counts}:"
-    return "\n\n".join((title, table.worlds_markdown(tables, OWN), _reliability(facts)))
+    return "\n\n".join((title, _table(facts), _reliability(facts)))
 
 
 def world_block(run: Path, world: str) -> str:

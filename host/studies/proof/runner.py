@@ -106,6 +106,7 @@ def prove(settings: Settings, progress: Progress, announce: Callable[[str], None
             world: {
                 "labels_sha256": digests[world],
                 "table": table.tabulate(each),
+                "shares": {key: asdict(share) for key, share in table.shares(each).items()},
                 "reliability": [asdict(b) for b in table.reliability(each)],
             }
             for world, each in facts.items()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from host.studies.proof.scoring import Facts, mean
 
@@ -79,11 +80,11 @@ WIDE = 1.34  # a case counts for rho where its own is within this factor
 Table = dict[str, float | int | None]
 
 
-def tabulate(facts: Sequence[Facts]) -> Table:
-    """The figures that `seldinger prove --json` prints as `table`. A share is None where no case has a say in it."""
+def outcomes(facts: Sequence[Facts]) -> dict[str, list[bool]]:
+    """What each case, or each parameter, says to every figure that is a share of them."""
 
-    def share(which: Callable[[Facts], bool], of: Callable[[Facts], bool | None]) -> float | None:
-        return mean([float(bool(of(f))) for f in facts if which(f) and of(f) is not None])
+    def said(which: Callable[[Facts], bool], of: Callable[[Facts], bool | None]) -> list[bool]:
+        return [bool(of(f)) for f in facts if which(f) and of(f) is not None]
 
     def near(rho: float) -> Callable[[Facts], bool]:
         return lambda f: f.category in ("single", "pair", "outside") and rho / WIDE <= f.rho <= rho * WIDE
@@ -91,39 +92,76 @@ def tabulate(facts: Sequence[Facts]) -> Table:
     def big(*categories: str) -> Callable[[Facts], bool]:
         return lambda f: f.category in categories and f.rho_wanted >= 0.5
 
+    def of_library(f: Facts) -> bool:
+        return f.category in ("single", "pair")
+
+    def outside(f: Facts) -> bool:
+        return f.category == "outside"
+
+    return {
+        "detected_rho_0.25": said(near(0.25), lambda f: f.detected),
+        "detected_rho_0.5": said(near(0.5), lambda f: f.detected),
+        "named_first": said(big("single"), lambda f: f.named_first),
+        "truth_in_set": said(big("single"), lambda f: f.in_set),
+        "confident_wrong_in_library": said(of_library, lambda f: f.wrong),
+        "confident_wrong_outside": said(outside, lambda f: f.wrong),
+        "subsystem_right": said(big("single", "outside"), lambda f: f.subsystem),
+        "pairs_exact": said(big("pair"), lambda f: f.exact),
+        "outside_flagged": said(outside, lambda f: f.flagged),
+        "equation_form": said(big("outside"), lambda f: f.form),
+        "coverage_95": [covered for f in facts if of_library(f) for covered in f.covered],
+        "confident_wrong": said(lambda f: f.category != "null", lambda f: f.wrong),
+    }
+
+
+def tabulate(facts: Sequence[Facts]) -> Table:
+    """The figures that `seldinger prove --json` prints as `table`. A share is None where no case has a say in it."""
+
     def middle(values: list[float]) -> float | None:
         return float(np.median(values)) if values else None
 
     library = [f for f in facts if f.category in ("single", "pair")]
-    return {
+    shown = [
+        f for f in facts if f.category in ("single", "pair", "outside") and f.rho_wanted >= 0.5 and f.detected and f.windows
+    ]
+    table: Table = {
         "null_cases": sum(f.category == "null" for f in facts),
         "false_alarms": sum(f.category == "null" and f.detected for f in facts),
-        "detected_rho_0.25": share(near(0.25), lambda f: f.detected),
-        "detected_rho_0.5": share(near(0.5), lambda f: f.detected),
-        "named_first": share(big("single"), lambda f: f.named_first),
-        "truth_in_set": share(big("single"), lambda f: f.in_set),
-        "confident_wrong_in_library": share(lambda f: f.category in ("single", "pair"), lambda f: f.wrong),
-        "confident_wrong_outside": share(lambda f: f.category == "outside", lambda f: f.wrong),
-        "subsystem_right": share(big("single", "outside"), lambda f: f.subsystem),
-        "window_f1": mean(
-            [f.window_f1 or 0.0 for f in facts if big("single", "pair", "outside")(f) and f.detected and f.windows]
-        ),
-        "pairs_exact": share(big("pair"), lambda f: f.exact),
-        "outside_flagged": share(lambda f: f.category == "outside", lambda f: f.flagged),
-        "equation_form": share(big("outside"), lambda f: f.form),
+        "window_f1": mean([f.window_f1 or 0.0 for f in shown]),
         "parameter_error_median": middle([e for f in library for e in f.parameter_errors]),
-        "coverage_95": mean([float(c) for f in library for c in f.covered]),
         "gap_closed_in_library": middle([f.gap_closed for f in library if f.gap_closed is not None]),
         "gap_closed_outside": middle([f.gap_closed for f in facts if f.category == "outside" and f.gap_closed is not None]),
         "seconds_per_case_median": middle([f.seconds for f in facts if np.isfinite(f.seconds)]),
         "nulls_named": sum(f.category == "null" and f.named for f in facts),
-        "confident_wrong": mean([float(f.wrong) for f in facts if f.category != "null"]),
         "gap_closed": middle([f.gap_closed for f in facts if f.gap_closed is not None]),
         "reliability_worst": worst_bin(reliability(facts)),
         "processor_s_per_60_s_median": middle([f.processor_s for f in facts if np.isfinite(f.processor_s)]),
         "processor_s_per_60_s_worst": max((f.processor_s for f in facts if np.isfinite(f.processor_s)), default=None),
         "failed": sum(f.failed for f in facts),
     }
+    table |= {key: mean([float(yes) for yes in said]) for key, said in outcomes(facts).items()}
+    return {key: table[key] for key in KEYS}
+
+
+@dataclass(frozen=True)
+class Share:
+    """How many of `of` cases or parameters make a share, and its 95 % interval by Wilson's score."""
+
+    count: int
+    of: int
+    low: float
+    high: float
+
+    @classmethod
+    def counted(cls, count: int, of: int) -> Share:
+        """The share of `count` in `of`, which is at least one."""
+        low, high = stats.binomtest(count, of).proportion_ci(0.95, method="wilson")
+        return cls(count, of, float(low), float(high))
+
+
+def shares(facts: Sequence[Facts]) -> dict[str, Share]:
+    """The counts of every figure that is a share, those that no case has a say in left out."""
+    return {key: Share.counted(sum(said), len(said)) for key, said in outcomes(facts).items() if said}
 
 
 @dataclass(frozen=True)
@@ -155,27 +193,38 @@ def worst_bin(bins: Sequence[Bin]) -> float | None:
 
 
 def reliability_markdown(bins: dict[str, list[Bin]]) -> str:
-    """Reliability of every world as markdown."""
+    """Reliability of every world as markdown, with the 95 % interval (Wilson) of the share that is true."""
     lines = ["| world | stated | statements | mean stated | true |", "|---|---|---|---|---|"]
-    lines += [
-        f"| {world} | {b.low:.1f} to {b.high:.1f} | {b.count} | {b.stated:.2f} | {b.true:.2f} |"
-        for world, each in bins.items()
-        for b in each
-    ]
+    for world, each in bins.items():
+        for b in each:
+            true = Share.counted(round(b.true * b.count), b.count)
+            lines.append(
+                f"| {world} | {b.low:.1f} to {b.high:.1f} | {b.count} | {b.stated:.2f} | {b.true:.2f} "
+                f"({true.low:.2f} to {true.high:.2f}) |"
+            )
     return "\n".join(lines)
 
 
-def worlds_markdown(tables: dict[str, Table], own: str) -> str:
-    """The figures of all worlds side by side, with what is to be reached on the own world and on the others."""
+def worlds_markdown(tables: dict[str, Table], counted: dict[str, dict[str, Share]], own: str) -> str:
+    """The figures of all worlds, with what is to be reached on the own world and on the others.
+
+    A share has its count and its 95 % interval (Wilson): few cases say little.
+    """
     lines = [
         f"| figure | to reach, {own} / other | {' | '.join(tables)} |",
         "|---|---|" + "---|" * len(tables),
         f"| cases with nothing planted | | {' | '.join(_text(t['null_cases']) for t in tables.values())} |",
     ]
     for key, (here, there) in WORLD_TARGETS.items():
-        cells = " | ".join(_text(t[key]) for t in tables.values())
+        cells = " | ".join(_of(t[key], counted[world].get(key)) for world, t in tables.items())
         lines.append(f"| {key.replace('_', ' ')} | {here} / {there} | {cells} |")
     return "\n".join(lines)
+
+
+def _of(value: float | int | None, share: Share | None) -> str:
+    if share is None:
+        return _text(value)
+    return f"{_text(value)}, {share.count} of {share.of} ({share.low:.2f} to {share.high:.2f})"
 
 
 def markdown(table: Table, baselines: dict[str, dict[str, Any]]) -> str:

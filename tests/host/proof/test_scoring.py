@@ -5,7 +5,7 @@ import pytest
 
 from host.studies.proof.equation_form import right_form
 from host.studies.proof.scoring import gap_closed, judge, parameters, window_f1
-from host.studies.proof.table import KEYS, tabulate
+from host.studies.proof.table import KEYS, shares, tabulate, worlds_markdown
 from tests.host.proof.suite import answer
 
 PLANTED = {
@@ -188,6 +188,18 @@ def test_table_of_a_finder_that_knows_all() -> None:
         table["parameter_error_median"] == 0.0 and table["coverage_95"] == 1.0 and table["window_f1"] == pytest.approx(1.0)
     )
     assert table["detected_rho_0.25"] is None
+
+
+def test_a_share_states_how_many_cases_it_rests_on() -> None:
+    facts = [judge(LABEL, answer(LABEL)), judge(LABEL, answer(LABEL)), judge(LABEL, SILENT), judge(NULL, SILENT)]
+    first = shares(facts)["named_first"]
+    # Wilson (1927): (p + z^2/2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2/n) with p = 2/3, n = 3, z = 1.96
+    assert (first.count, first.of) == (2, 3)
+    assert (first.low, first.high) == (pytest.approx(0.2077, abs=1e-3), pytest.approx(0.9385, abs=1e-3))
+    assert "pairs_exact" not in shares(facts)
+    text = worlds_markdown({"own": tabulate(facts)}, {"own": shares(facts)}, "own")
+    assert "| named first | 0.92 / 0.80 | 0.667, 2 of 3 (0.21 to 0.94) |" in text
+    assert "| pairs exact | 0.85 / 0.60 |  |" in text
 
 
 @pytest.mark.parametrize(("label", "true"), [(LABEL, False), (NULL, True), (OUTSIDE, True)])
