@@ -65,6 +65,7 @@ EFFECTS = (
         forms=("loop",),
         contains=("rate_lag", "backlash"),
         remembers=True,
+        filters=True,
     ),
     Effect(
         "dead_zone",

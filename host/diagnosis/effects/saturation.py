@@ -103,6 +103,7 @@ EFFECTS = (
             forms=("loop",),
             contains=("rate_lag",),
             remembers=True,
+            filters=True,
         ),
         Effect(
             "saturation",

@@ -102,6 +102,11 @@ class Problem:
         """Return the standard deviation of each output's noise (outputs,), in its own unit."""
         return np.array([noise.sigma for noise in self.noise])
 
+    def reading_step(self, row: int) -> float:
+        """Step in which an output is read; 0 where none is seen."""
+        steps = [float(segment.resolution[row]) for segment in self.segments if segment.resolution is not None]
+        return math.sqrt(12.0) * max(steps, default=0.0)
+
     def gain(self, which: str, before: list[Array], after: list[Array], segments: list[Segment] | None = None) -> Gain:
         """Gain of the residuals `after` over `before` on samples `which` (`fit`, `heldout`, `both`), see `compare`.
 

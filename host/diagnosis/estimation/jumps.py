@@ -25,13 +25,16 @@ class Jump:
     size: float
 
 
-def jumps_of(residuals: Sequence[Array], rules: SelectionRules) -> list[Jump]:
-    """Jumps in residuals (n_i,) of recordings, in order; none where the level steps again and again."""
+def jumps_of(residuals: Sequence[Array], rules: SelectionRules, step: float = 0.0) -> list[Jump]:
+    """Jumps in residuals (n_i,) of recordings, in order; none where the level steps again and again.
+
+    step: in which the output is read. Rounding is off by half of it at most, so it makes no larger jump than one step.
+    """
     found: list[Jump] = []
     for number, r in enumerate(residuals):
         if np.isfinite(r).sum() < 10 * SIDE:
             continue
-        own = _jumps(fill(r), number, rules)
+        own = _jumps(fill(r), number, rules, step)
         if len(own) > rules.jumps_per_recording:
             return []
         found += own
@@ -48,11 +51,12 @@ def steps_there(signal: Array, sample: int, least: float, rules: SelectionRules)
     return near > least * float(np.ptp(signal)) and near > rules.jump_abrupt_share * far
 
 
-def _jumps(r: Array, number: int, rules: SelectionRules) -> list[Jump]:
+def _jumps(r: Array, number: int, rules: SelectionRules, step: float) -> list[Jump]:
     shift, abrupt = _shift(r, SIDE), _shift(r, NEAR)
     level = 1.4826 * float(np.median(np.abs(shift - np.median(shift)))) + 1e-300
     found: list[Jump] = []
-    left = np.where(np.abs(shift) > rules.jump_deviations * np.maximum(level, _scatter(r)), np.abs(shift), 0.0)
+    least = np.maximum(rules.jump_deviations * np.maximum(level, _scatter(r)), step)
+    left = np.where(np.abs(shift) > least, np.abs(shift), 0.0)
     while left.size and np.max(left) > 0.0 and len(found) <= rules.jumps_per_recording:
         place = int(np.argmax(left))
         at = place + SIDE  # first sample after it

@@ -183,7 +183,7 @@ class Effect:
     hides: bool = False  # the nominal parameters cannot be fitted without it
     shifts: str = ""  # its parameter is a delay: "time", or "rate" of one that grows
     joins: tuple[tuple[str, str], ...] = ()  # effects (id, form) of one parameter each that it is the sum of, in their order
-    filters: bool = False  # a linear law of its motion with memory: it can take noise out of a motion
+    filters: bool = False  # a law of its motion with memory, linear where no limit is reached: it can take noise out
     invariant: bool = False  # linear and time-invariant: before or behind a linear plant it does the same
     rounded: bool = False  # a law without its corner: it takes the place of that law where the data call for it
     # Start values from the parameters of a mode of the drive that may be taken for it, and how late (s) the drive then is.

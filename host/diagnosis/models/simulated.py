@@ -22,6 +22,7 @@ from scipy.signal import fftconvolve
 
 from host.diagnosis.effects import library
 from host.diagnosis.effects.gravity_load import COMPONENT, constant_load, payload
+from host.diagnosis.estimation.noise_of_inputs import noise_through
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import (
     FORCES,
@@ -325,13 +326,14 @@ class SimulatedModel(Model):
         """Outputs of several recordings; those whose run is not kept are run together."""
         runs = [self.run_of(segment, theta, active) for segment in segments]
         new = {run.key: run for run in runs if run.key not in self._kept}
+        wholes = {run.key: self._kept[run.key] for run in runs if run.key not in new}  # before the new ones push them out
         began = time.perf_counter()
-        wholes = dict(zip(new, self.run_many(list(new.values())), strict=True))
+        wholes |= zip(new, self.run_many(list(new.values())), strict=True)
         if new:
             self.calls, self.call_s = self.calls + len(new), self.call_s + time.perf_counter() - began
         out = []
         for segment, run in zip(segments, runs, strict=True):
-            whole = wholes[run.key] if run.key in wholes else self._kept[run.key]
+            whole = wholes[run.key]
             self._keep(run.key, whole)
             rows = []
             for row, name in zip(whole + self._payload(segment, active), self.section.outputs, strict=True):
@@ -577,6 +579,10 @@ class SimulatedModel(Model):
         u = segment.inputs[name]
         before = apply_effects(u, here, name, segment, None)
         return slopes[name].to(apply_effects(u, [*here, (candidate, values)], name, segment, None) - before)
+
+    def noise_of_inputs(self, segment: Segment, theta: Array) -> Array:
+        """Noise of each output (outputs,) that was read with the inputs of the simulator."""
+        return noise_through(self, segment, theta)
 
     def answer(self, slope: StepResponse, moved: Array) -> Array:
         """Change of the outputs (outputs, n) when an input changes by `moved` (n,)."""

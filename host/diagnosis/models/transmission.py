@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.effects import library
+from host.diagnosis.estimation.noise_of_inputs import noise_through
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Effect, Parameter, Port, is_force
 from host.diagnosis.model.model import (
@@ -163,6 +164,10 @@ class TransmissionModel(Model):
             signal = apply_effects(signal, active, name, segment, "output") + tares.get(link.output, 0.0)
             out[row] = apply_effects(signal, active, f"{name}_reading", segment, None)
         return out
+
+    def noise_of_inputs(self, segment: Segment, theta: Array) -> Array:
+        """Noise of each output (outputs,) that was read with the inputs of its link."""
+        return noise_through(self, segment, theta)
 
     def motion(self, segment: Segment, port: Port) -> Array:
         """Nominal input of the link, or its measured output for the reading port."""

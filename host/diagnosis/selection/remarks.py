@@ -59,7 +59,7 @@ def jumps_in_level(full: Problem, fits: FullRate) -> list[Finding]:
     """Sentences on jumps of the nominal residual that no effect explains, such as those of a sensor that was moved."""
     findings = []
     for row, output in enumerate(full.model.outputs):
-        jumps = jumps_of([r[row] for r in fits.nominal.residuals], full.rules)
+        jumps = jumps_of([r[row] for r in fits.nominal.residuals], full.rules, full.reading_step(row))
         if not jumps:
             continue
         places = []

@@ -74,7 +74,7 @@ def _above_noise(problem: Problem, found: Found) -> bool:
         left = _most_left(problem, found.best, row)
         if left > (measured if noise.source.seen_alone else rules.residual_over_guessed_noise) * levels[row]:
             return True
-        if none and jumps_of([r[row] for r in found.best.residuals], rules):
+        if none and jumps_of([r[row] for r in found.best.residuals], rules, problem.reading_step(row)):
             return True  # no noise does that
     return none and bool(structured_outputs(problem, found.best))
 

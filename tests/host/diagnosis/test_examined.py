@@ -248,8 +248,24 @@ def test_jumps_are_told_from_noise_and_from_friction() -> None:
     lone = 0.01 * rng.standard_normal(t.size)
     lone[::397] += 0.5
     assert not jumps_of([lone], RULES)
-    (jump,) = jumps_of([0.01 * rng.standard_normal(t.size) + 0.2 * (t > 17.0)], RULES)
+    fine = 0.002 * rng.standard_normal(t.size) + 0.1 * (t > 17.0)  # a motion that rests between two counts of an encoder
+    assert jumps_of([fine], RULES) and not jumps_of([fine], RULES, step=0.12)
+    (jump,) = jumps_of([0.01 * rng.standard_normal(t.size) + 0.2 * (t > 17.0)], RULES, step=0.12)
     assert abs(jump.sample - 1701) <= 1 and jump.size == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_counts_of_an_encoder_are_not_jumps(seed: int) -> None:
+    """A gear that runs at constant speeds between random places, read in 1024 counts: level jumps were reported."""
+    recordings, count = [], 2.0 * np.pi / 1024.0
+    for k in range(2):
+        rng, t = np.random.default_rng([107, seed, k]), np.arange(0.0, 8.0, 0.004)
+        turns = np.cumsum(rng.uniform(0.8, 2.0, 12))
+        x = np.interp(t, np.concatenate(([0.0], turns)), rng.uniform(-0.8, 0.8, 13))
+        recordings.append({"t": t, "x": x, "y": np.round((1.02 * x + 5e-4 * rng.standard_normal(t.size)) / count) * count})
+    content = sd.diagnose(recordings, LINK).as_dict()
+    assert content["verdict"] == "nothing_missing"
+    assert "jump" not in [finding["id"] for finding in content["data_findings"]]
 
 
 def test_the_filter_of_a_noisy_motion_is_no_physics() -> None:

@@ -20,6 +20,7 @@ from host.diagnosis.effects import candidates
 from host.diagnosis.model.effect import Array
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
+from host.diagnosis.models import simulated
 from host.diagnosis.pipeline import candidate_ports, prepare
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.refits import fit_nominal
@@ -81,6 +82,17 @@ def recorded(seed: int, dry: float, samples: int = 1500) -> dict[str, Array]:
 
 
 @pytest.mark.slow
+def test_a_kept_run_outlives_the_runs_that_push_it_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two recordings, room for one run: the run of the second was kept before, and the first one's took its place."""
+    problem = prepare(nominal_of(NOMINAL), [Table(str(seed), recorded(seed, 0.0)) for seed in (1, 2)])[1]
+    model, theta = problem.model, np.array([p.grid[0] for p in problem.model.parameters])
+    fresh = model.simulate_all(problem.segments, theta, [])
+    monkeypatch.setattr(simulated, "KEPT_BYTES", 1)
+    model.simulate_all(problem.segments[1:], theta, [])
+    again = model.simulate_all(problem.segments, theta, [])
+    assert all(np.array_equal(a, b) for a, b in zip(fresh, again, strict=True))
+
+
 def test_a_parameter_that_the_simulator_offers_is_named() -> None:
     verdict = sd.diagnose([recorded(k, 0.6) for k in range(3)], NOMINAL)
     (effect,) = verdict.effects
