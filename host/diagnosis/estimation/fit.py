@@ -87,7 +87,8 @@ class Problem:
     budget: Budget = field(default_factory=Budget)
     joint_states: bool = False  # whether parameters and initial states are fitted together: the model is a linear path
     noise_fed: bool = False  # the residual is mostly noise that a controller fed back (`find_feedback`)
-    noise_passed: float = 0.0  # share of the residual's variance that is noise of measured inputs, through the nominal law
+    noise_passed: float = 0.0  # share of the residual's variance that is noise of measured inputs, through the nominal law,
+    passed: Array = field(default_factory=lambda: np.zeros(0))  # and its variance in each output (outputs,)
     waits_s: float = 0.0  # time from the first sample on that is left out at least, while a dead time is fitted
     ends_s: float = 0.0  # and before the last one, while the drift of a clock is
     recorded_s: float = 0.0  # period of the samples as recorded, of which several may be averaged into one; 0: untimed
@@ -101,6 +102,14 @@ class Problem:
     def noise_sd(self) -> Array:
         """Return the standard deviation of each output's noise (outputs,), in its own unit."""
         return np.array([noise.sigma for noise in self.noise])
+
+    def passed_share(self, fit: Fit) -> float:
+        """Share of what `fit` leaves that is noise of measured inputs, in the output where that is most."""
+        if not self.passed.any():
+            return 0.0
+        power = np.sum([np.nansum(r**2, axis=1) for r in fit.residuals], axis=0)
+        samples = np.sum([np.sum(np.isfinite(r), axis=1) for r in fit.residuals], axis=0)
+        return float(np.max(np.minimum(self.passed * samples / np.maximum(power, 1e-300), 1.0)))
 
     def reading_step(self, row: int) -> float:
         """Step in which an output is read; 0 where none is seen."""

@@ -15,7 +15,7 @@ from host.diagnosis.estimation.initial_state import begun_again
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.refits import restarted
 from host.diagnosis.selection.screening import above_noise, term_of
-from host.diagnosis.selection.trial import Trial, bound_by, of_sampling, related, sure_together
+from host.diagnosis.selection.trial import Trial, bound_by, of_noise, of_sampling, related, sure_together
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -40,7 +40,7 @@ def best_pair(problem: Problem, nominal: Fit, trials: list[Trial], fit_next: Fit
     trials: effects fitted alone over `nominal`, all refused. fit_next: the best further effects over the fit of a trial.
     """
     rules = problem.rules
-    singles = _singles(trials, rules.joint_singles)
+    singles = _singles([trial for trial in trials if not of_noise(trial)], rules.joint_singles)
     earned = [t.both.log_likelihood - rules.parameter_penalty * (t.fit.fitted - nominal.fitted) for t in singles]
     called_for = max(earned, default=0.0) > rules.weak_log_likelihood
     if not called_for and not above_noise(problem, nominal, rules.joint_over_noise):
@@ -71,7 +71,7 @@ def best_pair(problem: Problem, nominal: Fit, trials: list[Trial], fit_next: Fit
             set_starts(problem, top.starts)
             other = _alone(problem, nominal, top.fit)
             seconds += [t for t in fit_next(other, top.starts) if len(t.fit.terms) == 2]
-        for second in (t for t in seconds if not of_sampling(t)):
+        for second in (t for t in seconds if not (of_sampling(t) or of_noise(t))):
             set_starts(problem, second.starts)
             fit, passed = second.fit, _passed(problem, nominal, second.fit, second.starts)
             if passed is not None and all(

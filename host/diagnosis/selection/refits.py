@@ -41,7 +41,8 @@ def fit_nominal(problem: Problem) -> Fit:
     fit = settled(problem, begun_again(problem, fit))
     fed = find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs, problem.rules)
     problem.noise_fed = fed and _over_own_noise(problem, fit) < problem.rules.residual_over_noise_nominal**2
-    problem.noise_passed = _of_inputs(problem, fit)
+    problem.passed = _of_inputs(problem, fit)
+    problem.noise_passed = problem.passed_share(fit)
     return fit
 
 
@@ -118,15 +119,13 @@ def fit_without(
     return finish(problem, begun_again(problem, less) if begin_again else less)
 
 
-def _of_inputs(problem: Problem, fit: Fit) -> float:
-    """Share of the residual's variance that noise of measured inputs makes through the nominal law, in the output where that
-    is most.
-    """
-    residual, passed = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
+def _of_inputs(problem: Problem, fit: Fit) -> Array:
+    """Variance (outputs,) that noise of measured inputs makes of the outputs through the nominal law."""
+    samples, passed = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
     for segment, r in zip(problem.segments, fit.residuals, strict=True):
-        residual += np.nansum(r**2, axis=1)
-        passed += np.sum(np.isfinite(r), axis=1) * problem.model.noise_of_inputs(segment, fit.values) ** 2
-    return float(np.max(np.minimum(passed / np.maximum(residual, 1e-300), 1.0)))
+        seen = np.sum(np.isfinite(r), axis=1)
+        samples, passed = samples + seen, passed + seen * problem.model.noise_of_inputs(segment, fit.values) ** 2
+    return np.asarray(passed / np.maximum(samples, 1.0))
 
 
 def _over_own_noise(problem: Problem, fit: Fit) -> float:
@@ -147,7 +146,7 @@ def _cancellable(problem: Problem, base: Fit) -> float:
     A law that amplifies what is fast in a force makes noise of the differences smaller. Where nothing but noise is left, all
     that it takes may be that.
     """
-    return 1.0 if _over_own_noise(problem, base) < 1.0 else problem.noise_passed
+    return 1.0 if _over_own_noise(problem, base) < 1.0 else problem.passed_share(base)
 
 
 def try_fit(problem: Problem, base: Fit, item: Screened) -> Trial:

@@ -247,9 +247,10 @@ def screen(
     ]
     lines = np.concatenate((known_Hz, lines_of(used, problem.segments[0].recording.dt_s)))
     resting = _resting(problem)
+    noisy = problem.noise_fed or problem.passed_share(fit) > problem.rules.noise_passed_share
     for count, candidate in enumerate(candidate_effects):
         progress("screening", count / len(candidate_effects))
-        if candidate.effect.cancels_noise and (problem.noise_fed or problem.noise_passed > problem.rules.noise_passed_share):
+        if candidate.effect.cancels_noise and noisy:
             continue
         drop = replaced_by(fit, candidate)
         if drop is None or (candidate.port.name in resting and not candidate.effect.at_rest and not candidate.source):

@@ -255,9 +255,14 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     return trial.passive and not gone and not at_bound(trial.fit) and not of_sampling(trial) and called_for(trial, base)
 
 
+def of_noise(trial: Trial) -> bool:
+    """Whether all that a trial takes may be noise of measured inputs, which a law with memory cancels."""
+    return trial.both.share < trial.rules.noise_passed_margin * trial.cancelled
+
+
 def called_for(trial: Trial, base: Fit) -> bool:
     """Whether the evidence of a trial is enough, wherever its parameters ended."""
-    if refuted(trial.heldout, trial.rules) or trial.both.share < trial.rules.noise_passed_margin * trial.cancelled:
+    if refuted(trial.heldout, trial.rules) or of_noise(trial):
         return False
     more = max(trial.fit.fitted - base.fitted, 0)
     if trial.crossed is not None and _across(trial, trial.crossed, more):
