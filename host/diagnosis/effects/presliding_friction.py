@@ -1,4 +1,6 @@
-"""Presliding friction: friction builds up over a distance after each reversal (Dahl; Maxwell slip; no memory but one)."""
+"""Presliding friction: friction builds up over a distance after each reversal (Dahl; damped bristles of Canudas de Wit et
+al., 1995; Maxwell slip; no memory but one).
+"""
 
 from __future__ import annotations
 
@@ -55,13 +57,17 @@ def levels(name: str, s: Scale) -> tuple[Parameter, ...]:
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Friction force when fully built up, and the distance over which that happens; of four elements in form `general`."""
+    """Friction force when fully built up, and the distance over which that happens; of four elements in form `general`. Form
+    `damped` adds the damping of the bristles while they bend.
+    """
     if form == "general":
         return (*levels("force", s), yielding(s, form, 5, 2.0 * BRISTLES, BRISTLES))
-    return (
-        Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True),
-        yielding(s, form, 6, 2.0 * BRISTLES, BRISTLES),
-    )
+    level = Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True)
+    distance = yielding(s, form, 6, 2.0 * BRISTLES, BRISTLES)
+    if form == "damped":
+        unit = f"{s.unit} s/{s.motion_unit}"
+        return level, distance, Parameter("damping", unit, (s.need / s.speed,), 0.0, np.inf, linear=True)
+    return level, distance
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -77,8 +83,8 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 def slots(p: Array, form: str) -> dict[str, float]:
     """Level and distance of the hysteretic force, and the levels of its elements."""
-    if form == "dahl":
-        return {"presliding": p[0], "presliding_distance": p[1]}
+    if form in ("dahl", "damped"):
+        return {"presliding": p[0], "presliding_distance": p[1], "bristle_damping": p[2] if form == "damped" else 0.0}
     each = p[:SLIP_ELEMENTS] if form == "general" else np.full(SLIP_ELEMENTS, p[0] / SLIP_ELEMENTS)
     elements = {f"slip_{k + 1}": float(level) for k, level in enumerate(each)}
     return {"presliding": float(np.sum(each)), "presliding_distance": p[-1], "slip_ratio": RATIO[form], **elements}
@@ -128,6 +134,20 @@ EFFECTS = (
         "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
         slots=slots,
         forms=("dahl", "maxwell"),
+        contains=("coulomb_friction",),
+        family="dry",
+        remembers=True,
+        dissipates=True,
+    ),
+    Effect(
+        "presliding_friction",
+        "bristle",  # of an axis that is simulated: a measured speed is smoothed over more than the distance
+        11,
+        force,
+        "Friction of {force} builds up over {distance} after each reversal; until then {damping} times the speed is added.",
+        "F = force*z + damping*distance*dz/dt,  dz = (1 - z*sign(dx))*dx/distance",
+        slots=slots,
+        forms=("damped",),
         contains=("coulomb_friction",),
         family="dry",
         remembers=True,

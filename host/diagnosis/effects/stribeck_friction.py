@@ -32,7 +32,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
             Parameter("kinetic_force", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
             Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
             Parameter("speed", f"{s.motion_unit}/s", tried, 0.05 * s.speed, 10 * s.speed, log=True),
-            Parameter("rise_share", "", (0.02, 0.1), 1e-3, SOONEST, log=True),
+            Parameter("rise_share", "", (0.02, 0.1), 1e-3, SOONEST, log=True, vanishes=True),
         )
     if form == "double":
         # Beyond the recorded speeds, its fall is one of the damping.

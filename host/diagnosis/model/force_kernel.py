@@ -62,6 +62,7 @@ SLOTS = (
     "smooth_excess",
     "smooth_stribeck",
     "smooth_power",
+    "bristle_damping",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -114,6 +115,7 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     SMOOTH_EXCESS,
     SMOOTH_STRIBECK,
     SMOOTH_POWER,
+    BRISTLE_DAMPING,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
@@ -268,7 +270,7 @@ def _slowed_by_rising(v_free: float, load: float, h_over_m: float, p: Array) -> 
 @njit(cache=True)
 def hysteresis(z: Array, dx: float, v: float, load: float, p: Array) -> float:
     """Presliding and load-dependent friction after a step dx at speed v; `z` (6,) is moved on: four Maxwell elements (or
-    one of Dahl), the load's, and the bristles of Stribeck friction.
+    one of Dahl, whose bristles may be damped), the load's, and the bristles of Stribeck friction.
     """
     force = 0.0
     side = 1.0 if dx > 0.0 else -1.0
@@ -282,6 +284,8 @@ def hysteresis(z: Array, dx: float, v: float, load: float, p: Array) -> float:
         else:
             z[0] = side + (z[0] - side) * math.exp(-abs(dx) / p[PRE_DISTANCE])
             force += p[PRESLIDING] * z[0]
+            if dx != 0.0:
+                force += p[BRISTLE_DAMPING] * (1.0 - z[0] * side) * v
     if p[LOAD] != 0.0:
         z[4] = side + (z[4] - side) * math.exp(-abs(dx) / p[LOAD_DISTANCE])
         force += p[LOAD] * abs(load - p[LOAD_ZERO]) * z[4]

@@ -82,7 +82,7 @@ class AxisModel(Model):
             outputs.append(Output(self.spec.input, force, name))
         self.outputs = tuple(outputs)
         self.ports = (
-            Port(name, "force", name, tuple(o.channel for o in outputs)),
+            Port(name, "force+bristle", name, tuple(o.channel for o in outputs)),
             Port(
                 f"{name}_drive",
                 "timing+limit+mode" if spec.axis.controller is None else "loop",

@@ -211,7 +211,7 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
     if not trials or problem.budget.spent():
         return trials
     least, fitted = trials[0].both.log_likelihood, {trial.candidate.key for trial in trials}
-    richer = [t for t in trials if t is trials[0] or (t.both.log_likelihood >= least and good_enough(t, best))]
+    richer = [t for t in trials if t is trials[0] or (t.both.log_likelihood >= least and called_for(t, best))]
     missing = [
         item
         for item in ranked
@@ -221,6 +221,7 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
     ]
     if not missing:
         return trials
+    missing.sort(key=lambda item: item.term.fitted)  # the simplest first; of equally simple ones, the most promising
     more = [*trials, *(try_fit(problem, best, item) for item in missing[: problem.rules.simpler_fits])]
     rank(problem, more, best)
     return more
