@@ -36,6 +36,7 @@ from host.diagnosis.selection.apart_from_model import outliers_of_residual
 from host.diagnosis.selection.between_recordings import inadequate, unlike_recordings
 from host.diagnosis.selection.corners import over_alike
 from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
+from host.diagnosis.selection.drifting import drifting
 from host.diagnosis.selection.early import early_outputs
 from host.diagnosis.selection.equivalence import (
     Standing,
@@ -288,7 +289,7 @@ def _diagnosed(
         standing = standings(problem, found)
     while fewer := without_improbable(problem, found, standing, remainder):
         standing, remainder = fewer
-    between = [] if budget.spent() else _parameters_differ(full, problem, found)
+    between = [] if budget.spent() else _parameters_differ(full, problem, found) or drifting(problem, found)
     if between and found.best.terms:
         found.best, standing = fit_nominal(problem), []
     standing = with_unlisted_rival(standing, remainder)

@@ -17,6 +17,7 @@ TEMPLATES = Path(__file__).parents[2] / "report" / "templates"
 NBSP = "\u00a0"
 PARAMETERS_DIFFER = {  # finding -> headline
     "changed": "The nominal parameters change within a recording",
+    "drifting": "A parameter drifts with time",
     "session": "The nominal parameters differ between the recordings",
 }
 

@@ -38,6 +38,7 @@ REMARKS = (
     "repeated",
     "session",
     "changed",
+    "drifting",
     "unexplained",
     *UNDECIDED,
 )  # findings that ask for no change of the data
@@ -139,6 +140,8 @@ def _unexplained(result: Diagnosis) -> str:
         return "Find what was changed between the recordings, or diagnose those that agree with each other apart."
     if any(f.id == "changed" for f in result.findings):
         return "Find what was changed at that time, or cut the recording there and diagnose the parts apart."
+    if any(f.id == "drifting" for f in result.findings):
+        return "Record the same motion at the begin, in the middle and at the end of a run, and compare them."
     if (
         result.verdict == "mismatch_not_identified"
         and result.spec.linear is not None
