@@ -65,7 +65,9 @@ def _jumps(r: Array, number: int, rules: SelectionRules, step: float) -> list[Ju
         near = near[sizes > rules.jump_abrupt_share * left[place]]
         if near.size:
             steps = (r[near] - r[near - 1]) * np.sign(shift[place])
-            found.append(Jump(number, int(near[np.argmax(steps)]), float(shift[place])))
+            sample = int(near[np.argmax(steps)])
+            if sample >= 2 * SIDE:  # before, an initial state may fade that is not quite right
+                found.append(Jump(number, sample, float(shift[place])))
         left[max(place - SIDE, 0) : place + SIDE + 1] = 0.0
     return sorted(found, key=lambda jump: jump.sample)
 

@@ -176,10 +176,12 @@ def chosen(model: Model, spec: EffectSpec, timed: bool) -> Candidate:
         )
     exact = [c for c in at if c.form == spec.form and c.source == (spec.source or c.source) and fits(c, spec)]
     if not exact:
+        alike = [c for c in at if fits(c, spec)] or at
+        written = [",".join(f"{key}={v}" for key, v in (("source", c.source), ("form", c.form)) if v) for c in alike]
         raise InputError(
             f"effect {spec.id}@{spec.at}",
             f"source {spec.source!r}, form {spec.form!r}, {', '.join(spec.values)}",
-            "a source and form of " + ", ".join(f"({c.source!r}, {c.form!r})" for c in at),
+            "in front of the values one of " + " | ".join(dict.fromkeys(text or "no source and form" for text in written)),
         )
     return exact[0]
 

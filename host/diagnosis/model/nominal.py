@@ -257,8 +257,13 @@ class LinearSpec(SimulatorSpec):
         space = self.A is not None and self.B is not None and self.C is not None
         if transfer == space:
             raise ValueError("either numerator and denominator, or A, B and C (and D)")
-        if transfer and (len(self.inputs), len(self.outputs)) != (1, 1):
-            raise ValueError("one input and one output for a transfer function; A, B, C and D for more")
+        actuation = self.feedback.actuation if self.feedback is not None else ""
+        compared = [name for name in self.outputs if name != actuation]
+        if transfer and (len(self.inputs), len(compared)) != (1, 1):
+            raise ValueError(
+                "one input and one output for a transfer function, and the output that is the actuation of linear.feedback; "
+                "A, B, C and D for more"
+            )
         return self
 
 

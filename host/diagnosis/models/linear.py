@@ -109,8 +109,10 @@ class LinearModel(SimulatedModel):
         outputs = len(section.outputs)
         if section.feedback is not None:
             loop = section.feedback
-            if loop.output not in section.outputs or loop.actuation not in ("", *section.outputs):
-                raise InputError("linear.feedback", [loop.output, loop.actuation], "channels of outputs")
+            for key, name in (("output", loop.output), ("actuation", loop.actuation or loop.output)):
+                if name not in section.outputs:
+                    known = ", ".join(section.outputs)
+                    raise InputError(f"linear.feedback.{key}", name, f"one of linear.outputs ({known}), or add it there")
             if section.inputs != [loop.reference]:
                 raise InputError("linear.inputs", section.inputs, f"the reference alone, {loop.reference}")
             outputs -= bool(loop.actuation)

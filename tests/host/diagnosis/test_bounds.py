@@ -12,7 +12,7 @@ import seldinger as sd
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import LARGEST_AMPLITUDE, Fit, Term, moved
 from host.diagnosis.estimation.rules import RULES, Budget
-from host.diagnosis.model.effect import Array, Candidate, Parameter, Port
+from host.diagnosis.model.effect import Array, Candidate, Parameter, Port, Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import prepare
@@ -50,6 +50,15 @@ def test_a_knee_may_be_sharp_but_not_wider_than_its_form(knee: float, refused: b
     limit = Parameter("limit", "N", (0.5,), 0.0, 1.0)
     edge = Parameter("knee", "N", (0.01,), 0.001, 0.2, log=True, shape=True)
     assert at_bound(ended(one("saturation", "both", "press_reading"), (limit, edge), [1.0, knee])) is refused
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.001, False), (0.33, True), (0.05, False)])
+def test_a_friction_that_falls_may_have_a_corner_as_sharp_as_it_likes(share: float, refused: bool) -> None:
+    """Stribeck friction of a drive in a loop was refused for it, and Coulomb friction named with 0.93."""
+    size = Scale("N", 1.0, -1.0, 1.0, 0.1, 1e-3, 1.0, 1e-2, 10.0, True, "N", motion_unit="m")
+    smooth = one("stribeck_friction", "smooth")
+    parameters = smooth.effect.parameters(size, "smooth")
+    assert at_bound(ended(smooth, parameters, [2.0, 1.0, 0.05, share])) is refused
 
 
 @pytest.mark.parametrize(("levels", "refused"), [((1.0, 0.5), False), ((-1.0, -0.5), False), ((1.0, -2.0), True)])

@@ -250,6 +250,8 @@ def test_jumps_are_told_from_noise_and_from_friction() -> None:
     assert not jumps_of([lone], RULES)
     fine = 0.002 * rng.standard_normal(t.size) + 0.1 * (t > 17.0)  # a motion that rests between two counts of an encoder
     assert jumps_of([fine], RULES) and not jumps_of([fine], RULES, step=0.12)
+    fading = np.where(t < 0.3, 0.2, 0.0)  # an initial state that is not quite right
+    assert not jumps_of([0.01 * rng.standard_normal(t.size) + fading], RULES)
     (jump,) = jumps_of([0.01 * rng.standard_normal(t.size) + 0.2 * (t > 17.0)], RULES, step=0.12)
     assert abs(jump.sample - 1701) <= 1 and jump.size == pytest.approx(0.2, rel=0.1)
 

@@ -13,6 +13,7 @@ from host.diagnosis.model.nominal import EffectSpec, nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build
 from host.diagnosis.pipeline import inspected, problems
+from protocol.errors import InputError
 
 JOINED = {"parameters", "taken"}  # attributes to which the known effects add
 
@@ -68,3 +69,10 @@ def test_a_simulator_with_a_known_effect_is_a_simulator(effects: list[EffectSpec
     spec = nominal_of(NOMINAL).model_copy(update={"effect": effects})
     model, _, _ = problems(spec, inspected(spec, recordings()).recordings)
     assert model.simulates
+
+
+def test_an_effect_of_several_forms_asks_for_one_as_it_is_written() -> None:
+    inner = build(nominal_of(NOMINAL))
+    late = EffectSpec(id="presliding_friction", at="u", values={"lost_motion_m": 0.1, "distance_m": 0.2})
+    with pytest.raises(InputError, match=r"in front of the values one of form=dahl \| form=maxwell \| form=reversal"):
+        Known(inner, [late], inspected(nominal_of(NOMINAL), recordings()).recordings)

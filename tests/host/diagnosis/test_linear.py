@@ -174,6 +174,18 @@ def test_the_loop_without_effects_is_the_recorded_one() -> None:
     assert np.max(np.abs(out[0] - columns["y"])) < 6e-5
 
 
+def test_a_transfer_function_has_its_actuation_as_a_second_output() -> None:
+    columns = loop_recorded(2)
+    states = {key: value for key, value in LOOP["linear"].items() if key not in "ABC"}
+    transfer = {**LOOP, "linear": {**states, "numerator": [1.0], "denominator": ["m", "c", 0.0]}}
+    model, problem = model_of(transfer, columns)
+    problem.segments[0].begin.values = np.zeros(3)
+    out = model.simulate(problem.segments[0], np.array([0.5, 3.0]), [])
+    assert np.max(np.abs(out[0] - columns["y"])) < 6e-5 and np.max(np.abs(out[1] - columns["f"])) < 6e-3
+    with pytest.raises(InputError, match=r"linear.feedback.actuation: found \"f\", wanted one of linear.outputs \(y\)"):
+        model_of({**LOOP, "linear": {**transfer["linear"], "outputs": ["y"]}}, columns)
+
+
 def backlash(u: Array, width: float = 0.3) -> Array:
     y = u.copy()
     for k in range(1, u.size):
