@@ -289,7 +289,9 @@ def _diagnosed(
         standing = standings(problem, found)
     while fewer := without_improbable(problem, found, standing, remainder):
         standing, remainder = fewer
-    between = [] if budget.spent() else _parameters_differ(full, problem, found) or drifting(problem, found)
+    between = [] if budget.spent() else _parameters_differ(full, problem, found)
+    if not between and (found.best.terms or remainder.sure):
+        between = drifting(problem, found)
     if between and found.best.terms:
         found.best, standing = fit_nominal(problem), []
     standing = with_unlisted_rival(standing, remainder)

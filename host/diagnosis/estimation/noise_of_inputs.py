@@ -37,7 +37,7 @@ def noise_through(model: Model, segment: Segment, theta: Array) -> Array:
     theta: nominal parameters. Inputs are those that may move without noise, `Model.quiet_inputs`. Takes four simulations.
     """
     rng, calm = np.random.default_rng(0), np.ones(segment.n, dtype=bool)
-    noise, surprise, drawn_surprise = {}, {}, {}
+    noise, innovation, drawn_innovation = {}, {}, {}
     for name in model.quiet_inputs:
         u = segment.inputs[name]
         sigma = reading_noise(u)
@@ -50,7 +50,7 @@ def noise_through(model: Model, segment: Segment, theta: Array) -> Array:
         near = np.abs(z) < FAR * usual
         calm &= near
         noise[name] = sigma * rng.standard_normal(u.size)
-        surprise[name], drawn_surprise[name] = np.where(near, z, 0.0), _unpredicted(noise[name], weights)
+        innovation[name], drawn_innovation[name] = np.where(near, z, 0.0), _unpredicted(noise[name], weights)
     out = np.zeros(len(model.outputs))
     if not noise:
         return out
@@ -60,8 +60,8 @@ def noise_through(model: Model, segment: Segment, theta: Array) -> Array:
         return model.simulate(replace(segment, inputs=inputs), theta, [])
 
     base, noisy = simulated(), simulated(noise)
-    response = base - simulated({name: -z for name, z in surprise.items()})
-    drawn = noisy - simulated(noise, {name: -z for name, z in drawn_surprise.items()})
+    response = base - simulated({name: -z for name, z in innovation.items()})
+    drawn = noisy - simulated(noise, {name: -z for name, z in drawn_innovation.items()})
     for row, (e, r, w, own) in enumerate(zip(segment.y - base, response, noisy - base, drawn, strict=True)):
         used = calm & np.isfinite(e)
         if np.count_nonzero(used) < LEAST or not (np.isfinite(r) & np.isfinite(w) & np.isfinite(own)).all():

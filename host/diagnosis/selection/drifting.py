@@ -30,7 +30,7 @@ STEP = 1e-4  # of a parameter's size, by which its rate is taken
 class _Drift:
     """Values (parameters,) of a structure, and those (KNOTS,) of its parameter `index` over the time of a recording.
 
-    first: squared residual that is left, to first order or in fact. starts: of the memories.
+    left: squared residual, to first order or in fact. starts: of the memories.
     """
 
     fit: Fit
@@ -47,7 +47,7 @@ def drifting(problem: Problem, found: Found) -> list[Finding]:
     Looked for where many effects are named, or these leave more than noise.
     """
     best, rules = found.best, problem.rules
-    if not best.terms or problem.budget.spent():
+    if problem.budget.spent():
         return []
     if len(best.terms) <= rules.partial_effects and inadequate(problem, best) is None:
         return []
@@ -192,9 +192,9 @@ def _said(problem: Problem, found: Found, drift: _Drift, residuals: list[Array])
     row = int(np.argmax(root_mean_square(problem, found.best.residuals) / np.maximum(problem.noise_sd, 1e-300)))
     output = problem.model.outputs[row]
     before, after = (root_mean_square(problem, r)[row] for r in (found.best.residuals, residuals))
-    named = ", ".join(term.candidate.name for term in found.best.terms)
+    named = "".join(f", and {term.candidate.name}" for term in found.best.terms)
     says = f"A parameter drifts with time: {p.name}{owner} is {course} {p.unit}".rstrip()
     says += f", at {KNOTS} equal distances from the begin of each recording to its end. So the model leaves {after:.3g} "
-    says += f"{output.unit} RMS; {before:.3g} is left with constant parameters and {named}. Something warms up, wears or "
+    says += f"{output.unit} RMS; {before:.3g} is left with constant parameters{named}. Something warms up, wears or "
     says += "runs empty, or an effect depends on what differs over the recording (amplitude, speed, load)."
     return Finding("drifting", problem.columns.get(output.channel, output.channel), says)

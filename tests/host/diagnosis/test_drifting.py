@@ -61,7 +61,7 @@ def test_a_mass_that_falls_is_stated_with_its_course() -> None:
 
 
 def test_nothing_drifts_where_the_effects_explain_the_motion() -> None:
-    """Neither where nothing is named: whether a parameter changes at an instant is asked there."""
+    """Nothing is named, and the nominal model leaves noise."""
     tables = [Table(str(seed), emptied(seed, 2.0)) for seed in (1, 2, 3)]
     problem = prepare(nominal_of(STAGE), tables)[1]
     nominal = fit_nominal(problem)
