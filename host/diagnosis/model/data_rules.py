@@ -26,7 +26,8 @@ class DataRules:
     outlier_fewest_samples: int = 50  # measured ones of a channel
     spike_error_share: float = 0.3  # of what a law leaves about a spike of an input, below which it holds without the spike:
     # an answer that is late by some samples leaves half
-    motion_over_noise: float = 5.0  # of the other samples, from which a channel carries a motion and no single blows
+    motion_over_noise: float = 5.0  # of the other samples, from which a channel carries a motion and no single blows, and of
+    # what it moves while another one stays at its limit
     lost_jump_ratio: float = 4.0  # of the jump to a code over the changes that nine in ten do not exceed
     lost_code_returns: int = 3  # to the same value, from which that is a code for a lost reading
     lost_code_samples: int = 50  # in a row of such a code, at most

@@ -18,7 +18,7 @@ from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.dataset import Recording, named_apart
 from host.diagnosis.model.frozen import frozen_finding, frozen_readings, without_runs
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import fill
+from host.diagnosis.model.operators import fill, reading_noise
 from host.diagnosis.model.pairs import (
     LawFit,
     Pair,
@@ -492,10 +492,11 @@ def _seen(recording: Recording, name: str) -> float:
 def _clipped(y: Array, x: Array, side: float, rules: DataRules) -> float:
     """Share of the readings `y` (n,) in runs at the extreme one, in which their driver `x` (n,) continues and returns.
 
-    side: 1 for the largest reading, -1 for the smallest.
+    side: 1 for the largest reading, -1 for the smallest. What a noisy driver does while both rest is not to continue.
     """
     if np.ptp(x) == 0.0:
         return 0.0
+    least = max(rules.clipped_overrun * float(np.ptp(x)), rules.motion_over_noise * reading_noise(x))
     y = side * y
     x = x if float(np.corrcoef(x, y)[0, 1]) >= 0.0 else -x
     at = (y >= np.max(y)).astype(np.int8)
@@ -505,7 +506,7 @@ def _clipped(y: Array, x: Array, side: float, rules: DataRules) -> float:
         if last - first >= rules.clipped_run_samples:
             inside = x[first:last]
             beyond = float(np.max(inside) - max(inside[0], inside[-1]))
-            total += int(last - first) if beyond > rules.clipped_overrun * float(np.ptp(x)) else 0
+            total += int(last - first) if beyond > least else 0
     return total / y.size
 
 

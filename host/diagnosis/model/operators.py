@@ -14,7 +14,7 @@ STEADY_SHARE = 0.9  # of all changes of a reading that repeat the one before, fr
 RANGE = 6.0  # standard deviations between the extremes of noise in some hundred samples
 STEPPED = 0.7  # of the level of the spectrum, below which the usual second difference shows that steps make it
 LONGEST = 40  # samples to either side of one whose noise a parabola through them takes out
-WIDE_STEPS = 8  # from which on they show whether all are multiples of the smallest
+WIDE_STEPS = 3  # from which on they show whether all are multiples of the smallest
 LEAST_INERTIA = 1e-9  # in sample periods: below this a lag is of first order, or none
 
 

@@ -140,3 +140,7 @@ def test_quantum_finds_the_resolution() -> None:
     x = np.round(np.sin(np.linspace(0, 20, 3000)) / 0.01) * 0.01
     assert op.quantum(x) == pytest.approx(0.01, rel=1e-6)
     assert op.quantum(np.random.default_rng(0).normal(size=500)) == 0.0
+    for seed in range(20):  # a staircase of ten random levels is none
+        levels = np.random.default_rng(seed).uniform(-50.0, 50.0, 10)
+        assert op.quantum(np.repeat(levels, 300)) == 0.0
+    assert op.quantum(np.repeat(np.array([0.0, 1.0, 2.0, 5.0, 9.0, 30.0, 34.0]), 100)) == 1.0
