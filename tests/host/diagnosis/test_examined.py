@@ -256,7 +256,7 @@ def test_jumps_are_told_from_noise_and_from_friction() -> None:
     assert abs(jump.sample - 1701) <= 1 and jump.size == pytest.approx(0.2, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [1, 3])
 def test_counts_of_an_encoder_are_not_jumps(seed: int) -> None:
     """A gear that runs at constant speeds between random places, read in 1024 counts: level jumps were reported."""
     recordings, count = [], 2.0 * np.pi / 1024.0
