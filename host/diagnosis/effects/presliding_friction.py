@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from host.diagnosis.effects.coulomb_friction import BRISTLES
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
 from host.diagnosis.model.operators import SLIP_ELEMENTS, dahl, maxwell_slip, wiped_at_reversal
 
 RATIO = {"maxwell": 2.0, "general": 3.0}  # of the distances of neighbouring elements: all alike, or over a decade and more
@@ -90,81 +90,63 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"presliding": float(np.sum(each)), "presliding_distance": p[-1], "slip_ratio": RATIO[form], **elements}
 
 
+_LAG = Effect(
+    "presliding_friction",
+    "motion",
+    46,
+    lost,
+    "The output lags by up to {lost_motion}; the lag builds up over {distance} after each reversal.",
+    "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance; maxwell: four elements; reversal: "
+    "z = sign(dx)*(1 - 2*exp(-s/distance)), s since the last reversal",
+    apply,
+    forms=("dahl", "maxwell", "reversal"),
+    contains=("backlash", "coulomb_friction"),
+    family="dry",
+    remembers=True,
+    dissipates=True,
+)
 _LAGS = (
-    Effect(
-        "presliding_friction",
-        "motion",
-        46,
-        lost,
-        "The output lags by up to {lost_motion}; the lag builds up over {distance} after each reversal.",
-        "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance; maxwell: four elements; reversal: "
-        "z = sign(dx)*(1 - 2*exp(-s/distance)), s since the last reversal",
-        apply,
-        forms=("dahl", "maxwell", "reversal"),
-        contains=("backlash", "coulomb_friction"),
-        family="dry",
-        remembers=True,
-        dissipates=True,
-    ),
-    Effect(
-        "presliding_friction",
-        "motion",
-        46,
-        lost,
+    _LAG,
+    in_form(
+        _LAG,
+        "general",
         "The output lags by up to the sum of four elements that slide one after the other after each reversal; "
         "the third after {distance}.",
         "y = x - sum_k z_k,  z_k = clip(z_k + lost_motion_k*dx/d_k, -lost_motion_k, lost_motion_k),  d_k = 3^(k-3)*distance",
-        apply,
-        forms=("general",),
-        contains=("backlash", "coulomb_friction"),
-        family="dry",
-        remembers=True,
-        dissipates=True,
     ),
+)
+_FORCE = Effect(
+    "presliding_friction",
+    "force",
+    11,
+    force,
+    "Friction of {force} builds up over {distance} after each reversal.",
+    "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
+    slots=slots,
+    forms=("dahl", "maxwell"),
+    contains=("coulomb_friction",),
+    family="dry",
+    remembers=True,
+    dissipates=True,
 )
 EFFECTS = (
     *_LAGS,
     *(replace(effect, port="load") for effect in _LAGS),
-    Effect(
-        "presliding_friction",
-        "force",
-        11,
-        force,
-        "Friction of {force} builds up over {distance} after each reversal.",
-        "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
-        slots=slots,
-        forms=("dahl", "maxwell"),
-        contains=("coulomb_friction",),
-        family="dry",
-        remembers=True,
-        dissipates=True,
+    _FORCE,
+    replace(
+        in_form(
+            _FORCE,
+            "damped",
+            "Friction of {force} builds up over {distance} after each reversal; until then {damping} times the speed is "
+            "added.",
+            "F = force*z + damping*distance*dz/dt,  dz = (1 - z*sign(dx))*dx/distance",
+        ),
+        port="bristle",  # of an axis that is simulated: a measured speed is smoothed over more than the distance
     ),
-    Effect(
-        "presliding_friction",
-        "bristle",  # of an axis that is simulated: a measured speed is smoothed over more than the distance
-        11,
-        force,
-        "Friction of {force} builds up over {distance} after each reversal; until then {damping} times the speed is added.",
-        "F = force*z + damping*distance*dz/dt,  dz = (1 - z*sign(dx))*dx/distance",
-        slots=slots,
-        forms=("damped",),
-        contains=("coulomb_friction",),
-        family="dry",
-        remembers=True,
-        dissipates=True,
-    ),
-    Effect(
-        "presliding_friction",
-        "force",
-        11,
-        force,
+    in_form(
+        _FORCE,
+        "general",
         "Friction builds up in four elements that slide one after another after each reversal; the third after {distance}.",
         "F = sum_k z_k,  z_k = clip(z_k + force_k*dx/d_k, -force_k, force_k),  d_k = 3^(k-3)*distance",
-        slots=slots,
-        forms=("general",),
-        contains=("coulomb_friction",),
-        family="dry",
-        remembers=True,
-        dissipates=True,
     ),
 )

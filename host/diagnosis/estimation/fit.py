@@ -298,18 +298,20 @@ def jacobian(problem: Problem, terms: tuple[Term, ...], values: Array, base: Arr
     """Rate of the weighted simulation by each free parameter in its own scale, by one-sided differences that stay in
     bounds.
     """
-    parameters = problem.parameters(terms)
-    columns = []
-    for index in free(parameters):
-        p = parameters[index]
-        step = RATE_STEP if p.log else RATE_STEP * sizes[index]
-        moved = values.copy()
-        up = values[index] * (1.0 + step) if p.log else values[index] + step
-        down = values[index] * (1.0 - step) if p.log else values[index] - step
-        moved[index] = up if up <= p.high else down
-        by = (moved[index] / values[index] - 1.0) if p.log else (moved[index] - values[index]) / sizes[index]
-        columns.append((base - problem.stacked(terms, moved)) / by)
+    moving = free(problem.parameters(terms))
+    columns = [rate(problem, terms, values, base, index, sizes[index]) for index in moving]
     return np.array(columns).T if columns else np.zeros((base.size, 0))
+
+
+def rate(problem: Problem, terms: tuple[Term, ...], values: Array, base: Array, index: int, size: float) -> Array:
+    """Rate (samples,) of the weighted simulation by the parameter `index`, as in `jacobian`. base: stacked residuals."""
+    p, changed = problem.parameters(terms)[index], values.copy()
+    step = RATE_STEP if p.log else RATE_STEP * size
+    up = values[index] * (1.0 + step) if p.log else values[index] + step
+    down = values[index] * (1.0 - step) if p.log else values[index] - step
+    changed[index] = up if up <= p.high else down
+    by = (changed[index] / values[index] - 1.0) if p.log else (changed[index] - values[index]) / size
+    return np.asarray((base - problem.stacked(terms, changed)) / by)
 
 
 def parameter_rates(problem: Problem, fit: Fit, segment: Segment) -> Array:

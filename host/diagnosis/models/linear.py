@@ -130,8 +130,6 @@ class LinearModel(SimulatedModel):
                     raise InputError(
                         f"linear.{key}", f"{len(rows)} rows of {[len(row) for row in rows]}", f"{high} by {wide}"
                     )
-        elif outputs != 1:
-            raise InputError("linear.outputs", section.outputs, "one output of a transfer function, and the actuation")
         unused = next((name for name in spec.parameters if name not in used), None)
         if unused is not None:
             raise InputError(f"parameters.{unused}", "in no coefficient", "one of " + ", ".join(sorted(used)))

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from host.diagnosis.estimation.fit import Array, Fit, Problem, free, get_starts, jacobian, moved, set_starts, size_of
+from host.diagnosis.estimation.fit import Array, Fit, Problem, free, get_starts, jacobian, moved, rate, set_starts, size_of
 from host.diagnosis.model.readings import Finding
 from host.diagnosis.selection.between_recordings import inadequate, root_mean_square
 from host.diagnosis.selection.found import Found
@@ -23,7 +23,7 @@ from host.diagnosis.selection.found import Found
 KNOTS = 7
 MOST_TRIED = 5  # effects of the first step with which a parameter may drift: the one that promises most, of each
 ROUNDS = 10  # of Gauss and Newton's steps
-STEP = 1e-4  # of a parameter's size, by which its rate is taken
+GAINED = 1e-4  # of the squared residual, below which a step is the last one
 
 
 @dataclass(frozen=True)
@@ -119,16 +119,16 @@ def _fitted(problem: Problem, drift: _Drift) -> _Drift:
     set_starts(problem, drift.starts)
     terms, parameters, shapes = drift.fit.terms, problem.parameters(drift.fit.terms), _shapes(problem)
     p, others = parameters[drift.index], [k for k in free(parameters) if k != drift.index]
-    drift, r = _tried(problem, drift, drift.values, drift.course, shapes)
+    drift, stacks = _tried(problem, drift, drift.values, drift.course, shapes)
     damping = 1e-3
     for _ in range(ROUNDS):
-        values = drift.values.copy()
-        values[drift.index] = drift.course[KNOTS // 2]
-        sizes = [size_of(q, v) for q, v in zip(parameters, values, strict=True)]
-        constant = jacobian(problem, terms, values, problem.stacked(terms, values), sizes)
-        kept = [column for column, k in enumerate(free(parameters)) if k != drift.index]
-        rates = np.array([shapes[k] * _rate(problem, drift, k, sizes[drift.index]) for k in range(KNOTS)]).T
-        J = np.hstack((constant[:, kept], rates))
+        r = np.sum(shapes * stacks, axis=0)
+        at = [_with(drift, drift.values, value) for value in drift.course]  # values of each knot
+        sizes = [size_of(q, v) for q, v in zip(parameters, at[KNOTS // 2], strict=True)]
+        constant = [rate(problem, terms, at[KNOTS // 2], stacks[KNOTS // 2], k, sizes[k]) for k in others]
+        knots = zip(shapes, at, stacks, strict=True)
+        own = [shape * rate(problem, terms, now, own, drift.index, sizes[drift.index]) for shape, now, own in knots]
+        J = np.array([*constant, *own]).T
         size = np.linalg.norm(J, axis=0) + 1e-300
         A, g = (J / size).T @ (J / size), (J / size).T @ r
         for _ in range(6):
@@ -145,32 +145,24 @@ def _fitted(problem: Problem, drift: _Drift) -> _Drift:
             damping *= 10.0
         else:
             return drift
-        gained, drift, r, damping = 1.0 - trial.left / drift.left, trial, after, 0.1 * damping
-        if gained < STEP:
+        gained, drift, stacks, damping = 1.0 - trial.left / drift.left, trial, after, 0.1 * damping
+        if gained < GAINED:
             break
     return drift
 
 
+def _with(drift: _Drift, values: Array, value: float) -> Array:
+    """`values` with `value` for the parameter that drifts."""
+    now = values.copy()
+    now[drift.index] = value
+    return now
+
+
 def _tried(problem: Problem, drift: _Drift, values: Array, course: Array, shapes: Array) -> tuple[_Drift, Array]:
-    """`drift` with these values, and its residuals (samples,), weighted and stacked."""
-    r = np.zeros(shapes.shape[1])
-    for shape, value in zip(shapes, course, strict=True):
-        now = values.copy()
-        now[drift.index] = value
-        r += shape * problem.stacked(drift.fit.terms, now)
-    return replace(drift, values=values, course=course, left=float(r @ r)), r
-
-
-def _rate(problem: Problem, drift: _Drift, knot: int, size: float) -> Array:
-    """Rate (samples,) of the weighted simulation by the drifting parameter, in its own scale, at its value of one knot."""
-    p = problem.parameters(drift.fit.terms)[drift.index]
-    values = drift.values.copy()
-    values[drift.index] = value = drift.course[knot]
-    base = problem.stacked(drift.fit.terms, values)
-    step = STEP * (value if p.log else size)
-    values[drift.index] = value + step if value + step <= p.high else value - step
-    by = (values[drift.index] - value) / (value if p.log else size)
-    return np.asarray((base - problem.stacked(drift.fit.terms, values)) / by)
+    """`drift` with these values, and its weighted and stacked residuals with the value of each knot (KNOTS, samples)."""
+    stacks = np.array([problem.stacked(drift.fit.terms, _with(drift, values, value)) for value in course])
+    left = float(np.sum(np.sum(shapes * stacks, axis=0) ** 2))
+    return replace(drift, values=values, course=course, left=left), stacks
 
 
 def _residuals(problem: Problem, drift: _Drift) -> list[Array]:
@@ -178,8 +170,7 @@ def _residuals(problem: Problem, drift: _Drift) -> list[Array]:
     set_starts(problem, drift.starts)
     out = [np.zeros_like(segment.y) for segment in problem.segments]
     for knot, value in enumerate(drift.course):
-        values = drift.values.copy()
-        values[drift.index] = value
+        values = _with(drift, drift.values, value)
         for whole, segment in zip(out, problem.segments, strict=True):
             whole += _shape(segment.n)[knot] * problem.left(segment, drift.fit.terms, values)
     return out

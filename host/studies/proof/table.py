@@ -80,6 +80,14 @@ WIDE = 1.34  # a case counts for rho where its own is within this factor
 Table = dict[str, float | int | None]
 
 
+def _big(*categories: str) -> Callable[[Facts], bool]:
+    return lambda f: f.category in categories and f.rho_wanted >= 0.5
+
+
+def _of_library(f: Facts) -> bool:
+    return f.category in ("single", "pair")
+
+
 def outcomes(facts: Sequence[Facts]) -> dict[str, list[bool]]:
     """What each case, or each parameter, says to every figure that is a share of them."""
 
@@ -89,27 +97,21 @@ def outcomes(facts: Sequence[Facts]) -> dict[str, list[bool]]:
     def near(rho: float) -> Callable[[Facts], bool]:
         return lambda f: f.category in ("single", "pair", "outside") and rho / WIDE <= f.rho <= rho * WIDE
 
-    def big(*categories: str) -> Callable[[Facts], bool]:
-        return lambda f: f.category in categories and f.rho_wanted >= 0.5
-
-    def of_library(f: Facts) -> bool:
-        return f.category in ("single", "pair")
-
     def outside(f: Facts) -> bool:
         return f.category == "outside"
 
     return {
         "detected_rho_0.25": said(near(0.25), lambda f: f.detected),
         "detected_rho_0.5": said(near(0.5), lambda f: f.detected),
-        "named_first": said(big("single"), lambda f: f.named_first),
-        "truth_in_set": said(big("single"), lambda f: f.in_set),
-        "confident_wrong_in_library": said(of_library, lambda f: f.wrong),
+        "named_first": said(_big("single"), lambda f: f.named_first),
+        "truth_in_set": said(_big("single"), lambda f: f.in_set),
+        "confident_wrong_in_library": said(_of_library, lambda f: f.wrong),
         "confident_wrong_outside": said(outside, lambda f: f.wrong),
-        "subsystem_right": said(big("single", "outside"), lambda f: f.subsystem),
-        "pairs_exact": said(big("pair"), lambda f: f.exact),
+        "subsystem_right": said(_big("single", "outside"), lambda f: f.subsystem),
+        "pairs_exact": said(_big("pair"), lambda f: f.exact),
         "outside_flagged": said(outside, lambda f: f.flagged),
-        "equation_form": said(big("outside"), lambda f: f.form),
-        "coverage_95": [covered for f in facts if of_library(f) for covered in f.covered],
+        "equation_form": said(_big("outside"), lambda f: f.form),
+        "coverage_95": [covered for f in facts if _of_library(f) for covered in f.covered],
         "confident_wrong": said(lambda f: f.category != "null", lambda f: f.wrong),
     }
 
@@ -120,10 +122,8 @@ def tabulate(facts: Sequence[Facts]) -> Table:
     def middle(values: list[float]) -> float | None:
         return float(np.median(values)) if values else None
 
-    library = [f for f in facts if f.category in ("single", "pair")]
-    shown = [
-        f for f in facts if f.category in ("single", "pair", "outside") and f.rho_wanted >= 0.5 and f.detected and f.windows
-    ]
+    library = [f for f in facts if _of_library(f)]
+    shown = [f for f in facts if _big("single", "pair", "outside")(f) and f.detected and f.windows]
     table: Table = {
         "null_cases": sum(f.category == "null" for f in facts),
         "false_alarms": sum(f.category == "null" and f.detected for f in facts),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -15,24 +13,11 @@ from host.diagnosis.pipeline import prepare
 from host.diagnosis.selection.drifting import drifting
 from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.refits import fit_nominal
+from tests.host.proof.everyday import axis_nominal
 
 Array = npt.NDArray[np.float64]
 DT_S, STEPS = 0.01, 40
-STAGE: dict[str, Any] = {
-    "name": "stage",
-    "kind": "axis",
-    "data": {"time": "t"},
-    "channels": {"force": {"column": "f", "unit": "N"}, "speed": {"column": "v", "unit": "m/s"}},
-    "axis": {
-        "subsystem": "stage",
-        "input": "force",
-        "output": "speed",
-        "reads": "velocity",
-        "hold": "zero",
-        "terms": ["mass", "damping", "offset"],
-    },
-    "parameters": {"mass": 1.5, "damping": 6.0},
-}
+STAGE = axis_nominal("zero", "velocity", ("mass", "damping", "offset"), mass=1.5, damping=6.0)
 
 
 def emptied(seed: int, last_kg: float) -> dict[str, Array]:
@@ -47,7 +32,7 @@ def emptied(seed: int, last_kg: float) -> dict[str, Array]:
             mass = 2.0 + (last_kg - 2.0) * (i + step / STEPS) / t.size
             half = v + 0.5 * h * (f[i] - 5.0 * v) / mass
             v += h * (f[i] - 5.0 * half) / mass
-    return {"t": t, "f": f, "v": speed + 0.02 * rng.standard_normal(t.size)}
+    return {"t": t, "f": f, "x": speed + 0.02 * rng.standard_normal(t.size)}
 
 
 def test_a_mass_that_falls_is_stated_with_its_course() -> None:

@@ -14,6 +14,7 @@ from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import NothingToCompare, inspected, prepare
 from host.diagnosis.selection.refits import fit_nominal
+from tests.host.proof.everyday import spring_nominal
 
 GEAR: dict[str, Any] = {
     "name": "gear",
@@ -91,21 +92,13 @@ def test_an_input_that_is_held_at_levels_is_not_limited_there(force: Callable[[n
     assert "saturated" not in {finding.id for finding in said(stage(force), AXIS)}
 
 
-PAD: dict[str, Any] = {
-    "name": "pad",
-    "kind": "impedance",
-    "data": {"time": "t"},
-    "channels": {"place": {"column": "x", "unit": "m"}, "push": {"column": "f", "unit": "N"}},
-    "impedance": {"subsystem": "pad", "input": "place", "output": "push", "terms": ["damping", "stiffness"]},
-    "parameters": {"damping": 20.0, "stiffness": 120.0},
-}
-
-
 def test_a_place_that_rests_at_its_end_while_a_load_cell_is_noisy_is_not_limited_there() -> None:
     rng, t = np.random.default_rng(912), np.arange(0.0, 12.0, 0.01)
     x = 0.05 * np.interp(t % 4.0, [0.0, 0.5, 1.5, 2.0, 3.0, 3.5, 4.0], [-1.0, -1.0, 0.6, 0.6, -0.4, -0.4, -1.0])
     f = 30.0 * np.gradient(x, t) + 100.0 * x + 0.06 * rng.standard_normal(t.size)
-    assert "saturated" not in {finding.id for finding in said({"t": t, "x": x, "f": f}, PAD)}
+    assert "saturated" not in {
+        finding.id for finding in said({"t": t, "x": x, "f": f}, spring_nominal("damping", "stiffness"))
+    }
 
 
 def test_an_input_that_is_clipped_is_stated() -> None:

@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import pytest
 from numba import njit
 
 from host.diagnosis import diagnose
+from tests.host.proof.everyday import axis_nominal
 
 pytestmark = pytest.mark.slow
 Array = npt.NDArray[np.float64]
 DT_S, STEPS = 5e-3, 100
-
-
-def stage(reads: str, terms: list[str], **parameters: float) -> dict[str, Any]:
-    """A slide whose position or speed is read."""
-    return {
-        "name": "stage",
-        "kind": "axis",
-        "data": {"time": "t"},
-        "channels": {
-            "force": {"column": "f", "unit": "N"},
-            "out": {"column": "y", "unit": "m" if reads == "position" else "m/s"},
-        },
-        "axis": {"subsystem": "stage", "input": "force", "output": "out", "reads": reads, "hold": "zero", "terms": terms},
-        "parameters": parameters,
-    }
 
 
 @njit(cache=True)
@@ -66,8 +50,8 @@ def test_damped_bristles_are_presliding_and_not_a_friction_that_falls() -> None:
     for seed in (1, 2):
         rng, t, f = pushed(seed, 12.0, {0.25: 8.0, 0.8: 4.0, 1.7: 3.0})
         x = slide(f, (1.0, 8.0, 300.0), (2.0, 1500.0, 5.0))
-        recordings.append({"t": t, "f": f, "y": x + 1.5e-4 * rng.standard_normal(t.size)})
-    nominal = stage("position", ["mass", "damping", "stiffness", "offset"], mass=0.8, damping=12.0, stiffness=250.0)
+        recordings.append({"t": t, "f": f, "x": x + 1.5e-4 * rng.standard_normal(t.size)})
+    nominal = axis_nominal("zero", mass=0.8, damping=12.0, stiffness=250.0)
     (effect,) = diagnose(recordings, nominal).as_dict()["effects"]
     assert effect["id"] == "presliding_friction"
     assert effect["parameters"]["force_N"]["value"] == pytest.approx(2.0, rel=0.03)
@@ -85,8 +69,8 @@ def test_the_plain_lag_of_a_sensor_is_tried_before_richer_ones() -> None:
             lagged[i] = state
             for value in fine[20 * i : 20 * (i + 1)]:
                 state += (1.0 - np.exp(-DT_S / 20 / 0.025)) * (value - state)
-        recordings.append({"t": t, "f": f, "y": lagged + 3e-4 * rng.standard_normal(t.size)})
-    nominal = stage("position", ["mass", "damping", "stiffness", "offset"], mass=0.8, damping=6.0, stiffness=180.0)
+        recordings.append({"t": t, "f": f, "x": lagged + 3e-4 * rng.standard_normal(t.size)})
+    nominal = axis_nominal("zero", mass=0.8, damping=6.0, stiffness=180.0)
     verdict = diagnose(recordings, nominal).as_dict()
     (effect,) = verdict["effects"]
     assert effect["id"] == "rate_lag"
