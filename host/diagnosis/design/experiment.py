@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.design.excitation import Excitation, Span, family
-from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, jacobian, minimize, size_of
+from host.diagnosis.estimation.noise import correlation_time
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, alike_everywhere
 from host.diagnosis.selection.equivalence import Standing

@@ -10,10 +10,16 @@ an input. Each is tested on the innovations e of an autoregression of the residu
     inputs:  the coherence of e with inputs, their squares, magnitudes and directions (Welch; Carter 1987)
 
 The innovations of a slow wander say nothing of its shape. There the residual itself is compared with features of the
-inputs, with time, and between recordings (`structured`). Averaged over parts of a correlation time, the largest share of
-its variance that one feature takes is compared with that of surrogates: noise with the residual's own spectrum and random
-phases (Theiler et al., Physica D 1992). Few independent samples have chance correlations of any size (Yule 1926), and
-surrogates have as many. What nominal parameters absorb is removed from residual, features and surrogates alike.
+inputs, and between recordings (`structured`). Averaged over parts of a correlation time, the largest share of its variance
+that one feature takes is compared with that of surrogates of two kinds, and has to exceed both: noise with the residual's
+own spectrum and random phases (Theiler et al., Physica D 1992), and the residual itself with random signs of its parts,
+which keeps bursts where they are (Shao, JASA 2010). Few independent samples have chance correlations of any size (Yule
+1926), and surrogates have as many. What nominal parameters absorb is removed from residual, features and surrogates alike,
+and so is a trend of each recording: its ends do not meet, and random phases would not keep that.
+
+Where a controller hands the noise of an output on to an input, forms of this input follow the residual without any mismatch.
+Innovations show it (`feedback.handed_on`): noise of any colour is in the new part of an input some samples later. Features
+say nothing there, and recordings are compared with each other alone.
 """
 
 from __future__ import annotations
@@ -24,14 +30,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.feedback import unpredicted
-from host.diagnosis.estimation.noise import autoregression
+from host.diagnosis.estimation.feedback import ORDER, handed_on, unpredicted
+from host.diagnosis.estimation.noise import correlation_time, innovations
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.operators import fill, lag, play
 
 Array = npt.NDArray[np.float64]
-ORDER = 20  # of the autoregression
 LONGEST = 512  # samples of a part of a recording, of which at least
 PARTS = 16.0  # of an integrated correlation time (an eighth of the time constant) that a slow residual is averaged over
 SURROGATES = 999  # noises that a residual is compared with
@@ -57,7 +61,7 @@ def only_coloured(
     if not pairs:
         return False
     lines = [fill(r) - np.nanmean(r) for r, _ in pairs]
-    new, own = _innovations(lines), [u for _, u in pairs]
+    new, own = innovations(lines, ORDER), [u for _, u in pairs]
     significance = rules.coloured_significance
     if _jump(new, significance) or _repeat(new, significance):
         return False
@@ -81,7 +85,7 @@ def structured(
 ) -> bool:
     """Whether residuals (n_i,) of recordings have a structure that noise with their spectra hardly has.
 
-    An input (n_i,) that a controller computes from the output holds noise of the residual, and this is a structure too.
+    inputs: (n_i,) of each recording, and simulated outputs; compared unless noise of the residual is handed on to them.
     absorbed: (k, n_i) of each recording, what a change of each nominal parameter adds to the output.
     """
     long = [k for k, r in enumerate(residuals) if np.isfinite(r).sum() >= 20 * ORDER]
@@ -90,18 +94,23 @@ def structured(
     lines = [fill(residuals[k]) - np.nanmean(residuals[k]) for k in long]
     step = int(np.median([correlation_time(r) for r in lines]) / PARTS)
     step = max(1, step, -(-sum(r.size for r in lines) // MOST_PARTS))
-    rows = [_averaged(r, step) for r in lines]
-    tables = [_slow_features(inputs[k], step, len(rows)) for k in long]
+    rows, own_inputs = [_averaged(r, step) for r in lines], [inputs[k] for k in long]
+    repeats, follows = len(rows) > 1, all(own_inputs) and handed_on(lines, own_inputs, rules) is None
+    significance = rules.slow_structure_significance / max(repeats + follows, 1)
     rng = np.random.default_rng(0)
-    noises = [_surrogates(rng, r) for r in rows]
-    tests = []
-    if tables[0]:
-        own = [[_averaged(fill(rate), step) for rate in absorbed[k]] for k in long] if absorbed else [[] for _ in long]
-        tests.append(_of_features(rows, noises, tables, own))
-    if len(rows) > 1:
-        tests.append((_of_each_other([r[None, :] for r in rows])[0], _of_each_other(noises)))
-    limit = rules.slow_structure_significance / max(len(tests), 1) * (SURROGATES + 1)
-    return any(1 + np.count_nonzero(by_chance >= found) <= limit for found, by_chance in tests)
+    if repeats:
+        found = float(_of_each_other([row[None, :] for row in rows])[0])
+        if _p_value(found, _of_each_other([_random_phases(rng, row) for row in rows])) <= significance:
+            return True
+    if not follows:
+        return False
+    rows = [_without_trend(row) for row in rows]
+    features = [[_without_trend(_averaged(form, step)) for form in _slow_forms(u)] for u in own_inputs]
+    rates = [[_without_trend(_averaged(fill(rate), step)) for rate in absorbed[k]] for k in long if k < len(absorbed)]
+    return all(
+        _p_value(*_of_features(rows, [draw(rng, row) for row in rows], features, rates, rules)) <= significance
+        for draw in (_random_phases, _random_signs)
+    )
 
 
 def shifted(inputs: Sequence[Array]) -> Array:
@@ -114,19 +123,33 @@ def shifted(inputs: Sequence[Array]) -> Array:
     return np.array(rows)
 
 
-def _surrogates(rng: np.random.Generator, row: Array) -> Array:
+def _random_phases(rng: np.random.Generator, row: Array) -> Array:
     """Draws (SURROGATES, n) of noise with the spectrum of `row` (n,), whose mean is zero."""
     size = np.abs(np.fft.rfft(row))
     phase = rng.uniform(0.0, 2.0 * np.pi, (SURROGATES, size.size))
     return np.asarray(np.fft.irfft(size * np.exp(1j * phase), row.size, axis=1))
 
 
+def _random_signs(rng: np.random.Generator, row: Array) -> Array:
+    """Draws (SURROGATES, n) of `row` (n,) with a random sign for each part of a correlation time."""
+    length = max(1, round(correlation_time(row)))
+    begins = rng.integers(length, size=SURROGATES)
+    signs = rng.choice((-1.0, 1.0), (SURROGATES, row.size // length + 2))
+    part = (begins[:, None] + np.arange(row.size)) // length
+    return np.asarray(row * np.take_along_axis(signs, part, axis=1))
+
+
+def _p_value(found: float, by_chance: Array) -> float:
+    return float(1 + np.count_nonzero(by_chance >= found)) / (1 + by_chance.size)
+
+
 def _of_features(
-    rows: list[Array], noises: list[Array], tables: list[list[Array]], absorbed: list[list[Array]]
+    rows: list[Array], noises: list[Array], tables: list[list[Array]], absorbed: list[list[Array]], rules: SelectionRules
 ) -> tuple[float, Array]:
     """Largest share of the variance that one feature takes, of the residual and of each surrogate (SURROGATES,).
 
     Shares of a feature are relative to the one that a surrogate in twenty exceeds: features have unlike numbers of turns.
+    One that takes less of the residual than an effect has to is not a structure, however rare it is in noise.
     """
     kept = _left_by([np.concatenate(rates) for rates in zip(*absorbed, strict=True)])
     found, by_chance = kept(np.concatenate(rows)), kept(np.concatenate(noises, axis=1))
@@ -140,7 +163,9 @@ def _of_features(
             continue
         shares = (by_chance @ feature) ** 2 / (size * powers)
         usual = float(np.quantile(shares, 0.95)) + 1e-12
-        largest = max(largest, float(found @ feature) ** 2 / (size * power) / usual)
+        share = float(found @ feature) ** 2 / (size * power)
+        if share > rules.least_excess_reduction:
+            largest = max(largest, share / usual)
         largest_by_chance = np.maximum(largest_by_chance, shares / usual)
     return largest, largest_by_chance
 
@@ -161,6 +186,12 @@ def _averaged(x: Array, step: int) -> Array:
     return np.asarray(parts - np.mean(parts))
 
 
+def _without_trend(row: Array) -> Array:
+    """`row` (n,), whose mean is zero, less its best straight line."""
+    time = np.linspace(-1.0, 1.0, row.size)
+    return np.asarray(row - time * (time @ row) / (time @ time + 1e-300))
+
+
 def _of_each_other(rows: list[Array]) -> Array:
     """Share (count,) of the variance of draws (count, n_i) that is their mean over recordings, as a function of time."""
     n = min(r.shape[1] for r in rows)
@@ -169,31 +200,19 @@ def _of_each_other(rows: list[Array]) -> Array:
     return np.asarray(np.sum(mean**2, axis=1) / power)
 
 
-def _slow_features(inputs: Sequence[Array], step: int, recordings: int) -> list[Array]:
-    """Forms of the inputs of a recording, and of time if there are several, averaged over parts of `step` samples."""
-    table: list[Array] = []
+def _slow_forms(inputs: Sequence[Array]) -> list[Array]:
+    """Forms (n,) of the inputs (n,) of a recording that a slow residual may follow."""
+    forms: list[Array] = []
     filled = [fill(u) for u in inputs]
     for u in filled:
-        table += [*_features(u), np.gradient(u)]
-        table += [play(u, 0.5 * width * float(np.ptp(u)), 0.0) - u for width in PLAYS]
-        table += [lag(u, 1.0, share * u.size) - u for share in LAGS]
-    table += [a * b for k, a in enumerate(filled) for b in filled[k + 1 :]]
+        forms += [*_features(u), np.gradient(u)]
+        forms += [play(u, 0.5 * width * float(np.ptp(u)), 0.0) - u for width in PLAYS]
+        forms += [lag(u, 1.0, share * u.size) - u for share in LAGS]
+    forms += [a * b for k, a in enumerate(filled) for b in filled[k + 1 :]]
     for a, b in itertools.product(filled, repeat=2):  # forces that go with one place and with another speed
         speed = np.gradient(b)
-        table += [a * speed, a * np.abs(speed), a * a * speed, np.abs(a) * np.sign(speed)]
-    if recordings > 1 and filled:
-        table.append(np.arange(filled[0].size, dtype=float))
-    return [_averaged(feature, step) for feature in table]
-
-
-def _innovations(lines: list[Array]) -> list[Array]:
-    """Innovations (n_i - ORDER,) of one autoregression of all recordings, in robust standard deviations."""
-    lags = np.array([sum(float(r[: r.size - k] @ r[k:]) for r in lines) for k in range(ORDER + 1)])
-    a = autoregression(lags)
-    new = [r[ORDER:] - np.column_stack([r[ORDER - k - 1 : r.size - k - 1] for k in range(ORDER)]) @ a for r in lines]
-    together = np.concatenate(new)
-    spread = 1.4826 * float(np.median(np.abs(together - np.median(together)))) + 1e-300
-    return [e / spread for e in new]
+        forms += [a * speed, a * np.abs(speed), a * a * speed, np.abs(a) * np.sign(speed)]
+    return forms
 
 
 def _jump(new: list[Array], significance: float) -> bool:

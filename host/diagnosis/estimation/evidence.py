@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from host.diagnosis.estimation.feedback import freed
+from host.diagnosis.estimation.noise import correlation_time
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.model import Segment
 
@@ -56,32 +57,6 @@ class Gain:
     def p_value(self) -> float:
         """One-sided p-value that there is no gain."""
         return self.paired if isinstance(self.paired, float) else self.paired.p_value
-
-
-def correlation_time(r: Array, longest: int | None = None) -> float:
-    """Integrated autocorrelation time (samples) of `r` (n,), NaN where not used; summed while pairs of lags stay
-    positive (Geyer 1992).
-    """
-    good = np.isfinite(r)
-    n = int(good.sum())
-    if n < 20:
-        return 1.0
-    x = np.where(good, r, 0.0)
-    size = 1 << int(np.ceil(np.log2(2 * x.size)))
-    power = np.abs(np.fft.rfft(x, size)) ** 2
-    count = np.fft.irfft(np.abs(np.fft.rfft(good.astype(float), size)) ** 2, size)[: x.size]
-    covariance = np.fft.irfft(power, size)[: x.size] / np.maximum(count, 1.0)
-    if covariance[0] <= 0.0:
-        return 1.0
-    rho = covariance / covariance[0]
-    limit = min(longest or x.size // 3, x.size // 3)
-    total = 1.0
-    for k in range(1, limit, 2):
-        pair = rho[k] + (rho[k + 1] if k + 1 < limit else 0.0)
-        if pair <= 0.03:
-            break
-        total += 2.0 * pair
-    return float(np.clip(total, 1.0, n / 4.0))
 
 
 def compare(

@@ -10,6 +10,10 @@ A controller that computes the input of a row from the reading of the same row s
 through the plant would look alike, but such a path passes all of the input alike, and noise is in its new part alone:
 the residual then follows the new part and not the other one. Noise of the input's own reading has the same signature.
 
+Coloured noise is predicted by its own past, and earlier new input holds this past: a law that passes small signals otherwise
+than large ones takes a part of the noise away. The innovations of the residual show feedback whatever the colour
+(`handed_on`); what new input says on both sides of a sample is then taken off.
+
 Where both sides of a law are compared behind a test function, the noise of a sample is in the residual before and after it.
 Earlier new input then holds noise as well, and a filter of the input could take it away.
 """
@@ -17,11 +21,12 @@ Earlier new input then holds noise as well, and a filter of the input could take
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.estimation.noise import innovation, innovations, predictor
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import fill
@@ -65,6 +70,42 @@ def _past(x: Array) -> Array:
     return np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
 
 
+def handed_on(
+    lines: list[Array], inputs: Sequence[Sequence[Array]], rules: SelectionRules, sure: bool = False
+) -> int | None:
+    """Samples after which innovations of the residuals `lines` (n_i,) are in the new part of an input; None if they are not.
+
+    inputs: (n_i,) of each recording. Innovations are white, so noise of any colour is seen here, unlike by `_share`.
+    sure: the residual must follow the new part alone where this is of the same sample or the next. A direct path through the
+    plant, and an input that is held in another way, look alike otherwise.
+    """
+    of_residuals = [np.concatenate((np.zeros(ORDER), e)) for e in innovations(lines, ORDER)]
+    for channel in range(min(len(u) for u in inputs)):
+        read = [fill(u[channel]) for u in inputs]
+        new = [common_part(u, rules)[0] for u in read]
+        size = sum(float(z @ z) for z in new) * sum(float(e @ e) for e in of_residuals)
+        for k in range(LAGS + 1):
+            both = sum(float(e[: e.size - k] @ z[k:]) for e, z in zip(of_residuals, new, strict=True))
+            if both * both > rules.feedback_share * size and (
+                k >= HELD or not sure or _new_alone(lines, read, new, k, rules)
+            ):
+                return k
+    return None
+
+
+def _new_alone(lines: list[Array], read: list[Array], new: list[Array], late: int, rules: SelectionRules) -> bool:
+    """Whether residuals `lines` (n_i,) follow the `new` part of an input (n_i,) `late` samples later and no other part.
+
+    All are freed of the residuals' own colour first.
+    """
+    parts = [[r[: r.size - late], z[late:], (u - z)[late:]] for r, u, z in zip(lines, read, new, strict=True)]
+    a = predictor([r for r, _, _ in parts], ORDER)
+    white = [np.array([innovation(x - np.mean(x), a) for x in part]) for part in parts]
+    e, z, held = np.concatenate(white, axis=1)
+    by_new, by_held = np.linalg.lstsq(np.column_stack((z, held)), e, rcond=1e-12)[0]
+    return bool(abs(by_new) >= rules.feedback_over_remainder * abs(by_held))
+
+
 def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...], rules: SelectionRules) -> bool:
     """Set `fed_back` of every segment, of the outputs whose residual is predicted by later `inputs` or at once.
 
@@ -79,14 +120,17 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
     if _said_by_motion(segments, inputs, rules) > rules.feedback_predicted_share:
         around = [_around(u, segment.spread) for segment, u in zip(segments, new, strict=True)]
     after, before = [_later(u, HELD) for u in new], [_earlier(u) for u in new]
-    handed_on = [_later(u, 1) for u in new]  # a rate that is interpolated sees the next sample, and its noise
+    after_next = [_later(u, 1) for u in new]  # a rate that is interpolated sees the next sample, and its noise
+    both_sides = [_around(u, LAGS, SAMPLES_PER_LAG // 2) for u in new]
     for segment in segments:
         segment.fed_back = [None] * segment.y.shape[0]
     for row in range(segments[0].y.shape[0]):
         later, earlier = _share(after, residuals, row), _share(before, residuals, row)
         fed = later >= max(rules.feedback_share, rules.feedback_over_past * earlier)
-        if fed:
-            for segment, basis in zip(segments, handed_on, strict=True):
+        late = _delay(segments, residuals, row, inputs, rules)
+        coloured = late is not None and _share([_before(u, late) for u in new], residuals, row) >= rules.feedback_share
+        if fed or coloured:
+            for segment, basis in zip(segments, both_sides if coloured else after_next, strict=True):
                 segment.fed_back[row] = basis
         if around:
             noisy = noisy or _share(around, residuals, row) > rules.feedback_predicted_share
@@ -98,6 +142,17 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
         for index, column in itertools.chain.from_iterable(at_once):
             segments[index].fed_back[row] = _with(segments[index].fed_back[row], column)
     return noisy
+
+
+def _delay(
+    segments: list[Segment], residuals: list[Array], row: int, inputs: tuple[str, ...], rules: SelectionRules
+) -> int | None:
+    """Samples after which innovations of output `row` are in new input; recordings are neither short nor very long."""
+    long = [k for k, segment in enumerate(segments) if ORDER * SAMPLES_PER_LAG <= segment.n <= MOST_SAMPLES]
+    lines = [np.nan_to_num(residuals[k][row]) for k in long]
+    read = [[segments[k].inputs[name] for name in inputs if name in segments[k].inputs] for k in long]
+    usable = bool(lines) and all(read) and all(map(np.any, lines))
+    return handed_on(lines, read, rules, sure=True) if usable else None
 
 
 def _at_once(
@@ -182,19 +237,24 @@ def _said_by_motion(segments: list[Segment], inputs: tuple[str, ...], rules: Sel
     return 1.0 - together / alone if alone > 0.0 else 0.0
 
 
-def _around(new: list[Array], spread: int) -> Array | None:
+def _around(new: list[Array], spread: int, samples_per_lag: int = SAMPLES_PER_LAG) -> Array | None:
     """The new input from `spread` samples before to LAGS more after: a test function spreads a sample's noise so far, and a
     controller hands it on later.
     """
     if not new:
         return None
-    most = max(1, new[0].size // SAMPLES_PER_LAG // len(new))
+    most = max(1, new[0].size // samples_per_lag // len(new))
     before, after = min(spread, most // 3), min(spread + LAGS, most - most // 3)
     return np.linalg.qr(np.column_stack([np.roll(u, k) for u in new for k in range(-after, before + 1)]))[0]
 
 
 def _earlier(new: list[Array]) -> Array | None:
     return _basis(new, lambda u, k: np.concatenate((np.zeros(k), u[: u.size - k])))
+
+
+def _before(new: list[Array], late: int) -> Array | None:
+    """The new input that holds the noise of earlier samples, where that of each is in the input `late` samples later."""
+    return _basis(new, lambda u, k: np.roll(u, k - late))
 
 
 def _basis(new: list[Array], moved: Callable[[Array, int], Array]) -> Array | None:

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
-from host.diagnosis.estimation.noise import Noise
+from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.noise import Noise, correlation_time
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, Port, cornered
 from host.diagnosis.model.model import ActiveEffect, Model, Segment

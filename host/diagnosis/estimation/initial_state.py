@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag
 
-from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import RAN_AWAY, Fit, Problem, Term, free, jacobian, minimize, moved, robust, size_of
+from host.diagnosis.estimation.noise import correlation_time
 from host.diagnosis.model.effect import memory_keys, rate_key
 from host.diagnosis.model.model import ActiveEffect, Model, Segment
 

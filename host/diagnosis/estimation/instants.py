@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize, robust
+from host.diagnosis.estimation.noise import correlation_time
 
 Array = npt.NDArray[np.float64]
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)

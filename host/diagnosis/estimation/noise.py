@@ -21,6 +21,7 @@ class NoiseSource(Enum):
     """What the noise of a channel was estimated from; the value is its name in a report."""
 
     QUIESCENT = "quiescent parts"
+    SHORT_RESTS = "quiescent parts, too short for slow noise"  # its level in them is less than elsewhere
     REPEATS = "differences between repeats"
     RESOLUTION = "resolution"  # at rest, or between repeats, the reading changes by less than one of its steps
     CONSTANT = "constant readings"  # these do not change at all and have no steps: computed, or stuck
@@ -191,7 +192,15 @@ def estimate(
     if sigma <= noise_sd:
         source = NoiseSource.RESOLUTION if noise_sd > 0.0 else NoiseSource.CONSTANT
         return Noise(max(noise_sd, 1e-300), np.zeros(0), source)
+    if source is NoiseSource.QUIESCENT and _slow_for(segments, rules):
+        source = NoiseSource.SHORT_RESTS
     return Noise(sigma, autoregression(lags), source)
+
+
+def _slow_for(rests: list[Array], rules: SelectionRules) -> bool:
+    """Whether noise at rest, stretches (n_i,) less a straight line each, is so slow that the line took a part of it."""
+    independent = sum(rest.size for rest in rests) / sum(correlation_time(rest) for rest in rests)
+    return independent < rules.rest_independent_samples
 
 
 def _of_spectrum(outputs: list[Array], resolution: float, rules: SelectionRules) -> Noise:
@@ -231,6 +240,52 @@ def autoregression(lags: Array) -> Array:
     damped = lags.copy()
     damped[0] *= 1.0 + 1e-6
     return np.asarray(solve_toeplitz(damped[:-1], damped[1:]))
+
+
+def innovations(lines: list[Array], order: int) -> list[Array]:
+    """Innovations (n_i - order,) of one autoregression of all recordings, in robust standard deviations."""
+    a = predictor(lines, order)
+    new = [innovation(r, a) for r in lines]
+    together = np.concatenate(new)
+    spread = 1.4826 * float(np.median(np.abs(together - np.median(together)))) + 1e-300
+    return [e / spread for e in new]
+
+
+def predictor(lines: list[Array], order: int) -> Array:
+    """Coefficients (order,) of one autoregression of all `lines` (n_i,)."""
+    return autoregression(np.array([sum(float(r[: r.size - k] @ r[k:]) for r in lines) for k in range(order + 1)]))
+
+
+def innovation(x: Array, ar: Array) -> Array:
+    """What `x` (n,) does beyond its prediction by the coefficients `ar` (p,) from its last p samples: (n - p,)."""
+    past = np.lib.stride_tricks.sliding_window_view(x[:-1], ar.size)
+    return np.asarray(x[ar.size :] - past @ ar[::-1])
+
+
+def correlation_time(r: Array, longest: int | None = None) -> float:
+    """Integrated autocorrelation time (samples) of `r` (n,), NaN where not used; summed while pairs of lags stay
+    positive (Geyer 1992).
+    """
+    good = np.isfinite(r)
+    n = int(good.sum())
+    if n < 20:
+        return 1.0
+    x = np.where(good, r, 0.0)
+    size = 1 << int(np.ceil(np.log2(2 * x.size)))
+    power = np.abs(np.fft.rfft(x, size)) ** 2
+    count = np.fft.irfft(np.abs(np.fft.rfft(good.astype(float), size)) ** 2, size)[: x.size]
+    covariance = np.fft.irfft(power, size)[: x.size] / np.maximum(count, 1.0)
+    if covariance[0] <= 0.0:
+        return 1.0
+    rho = covariance / covariance[0]
+    limit = min(longest or x.size // 3, x.size // 3)
+    total = 1.0
+    for k in range(1, limit, 2):
+        pair = rho[k] + (rho[k + 1] if k + 1 < limit else 0.0)
+        if pair <= 0.03:
+            break
+        total += 2.0 * pair
+    return float(np.clip(total, 1.0, n / 4.0))
 
 
 def _high_frequency(outputs: list[Array], rules: SelectionRules) -> float:

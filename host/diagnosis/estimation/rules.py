@@ -35,6 +35,7 @@ class SelectionRules:
     rest_resolution_steps: float = 2.1  # or steps of its resolution
     rest_shortest_samples: int = 30  # of a stretch at rest that counts
     rest_fewest_samples: int = 100  # of all such stretches together; with fewer, the noise is that of repeats
+    rest_independent_samples: float = 10.0  # of a stretch, below which slow noise has a higher level than at rest
     settling_variance_ratio: float = 3.0  # first halves' variance over that of the second ones, from which an output settles
     under_way_correlation: float = 0.8  # of neighbours, from which a slow plant is on its way while its input rests,
     under_way_over_noise: float = 3.0  # and its ratio to the noise that the spectrum suggests

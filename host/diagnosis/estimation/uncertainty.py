@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, answers_to_begin, free, jacobian, size_of
 from host.diagnosis.estimation.initial_state import answers_to_memories
 from host.diagnosis.estimation.instants import instant_interval
+from host.diagnosis.estimation.noise import correlation_time
 from host.diagnosis.model.effect import Parameter
 from host.diagnosis.model.findings import Finding
 

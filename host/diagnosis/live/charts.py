@@ -26,8 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.noise import autoregression
+from host.diagnosis.estimation.noise import autoregression, correlation_time
 
 Array = npt.NDArray[np.float64]
 ORDER = 3  # of the autoregression

@@ -23,6 +23,7 @@ class DataRules:
     outlier_noise_deviations: float = 12.0  # from the median of the neighbours,
     outlier_local_spreads: float = 8.0  # and deviations of these, from which a sample stands alone,
     outlier_resolution_steps: float = 2.5  # and steps of the resolution
+    outlier_expected_triples: float = 0.01  # of outliers that fall together by chance, from which three of seven may be
     outlier_fewest_samples: int = 50  # measured ones of a channel
     spike_error_share: float = 0.3  # of what a law leaves about a spike of an input, below which it holds without the spike:
     # an answer that is late by some samples leaves half

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 import numpy.typing as npt
@@ -29,14 +30,21 @@ class Finding:
 
 
 def wild(values: Array, sigma: float, rules: DataRules) -> Mask:
-    """Samples of `values` (n,) that stand alone, far from the median of their seven neighbours. sigma: noise."""
+    """Samples of `values` (n,) that stand alone, far from the median of the seven about them. sigma: noise.
+
+    Two of seven may stand alone; three, where outliers are so frequent that three fall together by chance.
+    """
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(fill(values), 3, mode="reflect"), 7)
     middle = np.median(windows, axis=1)
-    spread = np.sort(np.abs(windows - middle[:, None]), axis=1)[:, 4]
+    sizes = np.sort(np.abs(windows - middle[:, None]), axis=1)
     away = np.abs(fill(values) - middle)
-    far = away > rules.outlier_noise_deviations * sigma + rules.outlier_local_spreads * spread
-    step = resolution(values, rules, switched=False)
-    return np.asarray(far & (away > rules.outlier_resolution_steps * step) & np.isfinite(values))
+    beyond = rules.outlier_noise_deviations * sigma
+    measured = np.isfinite(values) & (away > rules.outlier_resolution_steps * resolution(values, rules, switched=False))
+    alone = measured & (away > beyond + rules.outlier_local_spreads * sizes[:, 4])
+    triples = values.size * comb(7, 3) * float(np.mean(alone)) ** 3
+    if triples > rules.outlier_expected_triples:
+        alone |= measured & (away > beyond + rules.outlier_local_spreads * sizes[:, 3])
+    return np.asarray(alone)
 
 
 def scatter(values: Array) -> float:

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from host.diagnosis.estimation.evidence import Gain, correlation_time
+from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts, size_of
 from host.diagnosis.estimation.initial_state import begun_again
+from host.diagnosis.estimation.noise import correlation_time
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.folds import unexcited

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.coloured import independent_samples
 from host.diagnosis.estimation.fit import Problem
 from host.diagnosis.estimation.jumps import jumps_of
+from host.diagnosis.estimation.noise import NoiseSource
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.spectral_line import common_line
 from host.diagnosis.selection.between_recordings import root_mean_square
@@ -137,12 +138,18 @@ def not_explained(full: Problem, fits: FullRate, figures: Figures, structured: l
         says = (
             f"The residual of column {column}, {ratio * noise.sigma:.3g} {output.unit} RMS, is {ratio:.2g} times the noise "
         )
-        says += "that was recorded alone" if noise.source.seen_alone else "that its spectrum suggests"
+        says += _that_is_known(noise.source)
         if row in structured:
             kept = 100.0 * (1.0 - rules.slow_structure_significance)
-            says += f", and follows the inputs, or time, more closely than {kept:.3g} % of noises with its spectrum"
+            says += f", and follows the inputs, or repeats, more closely than {kept:.3g} % of noises with its spectrum"
         findings.append(Finding("unexplained", column, says + ". No known effect explains it."))
     return findings
+
+
+def _that_is_known(source: NoiseSource) -> str:
+    if source.seen_alone:
+        return "that was recorded alone"
+    return "that short rests show" if source is NoiseSource.SHORT_RESTS else "that its spectrum suggests"
 
 
 def larger_than_noise(full: Problem, fits: FullRate, figures: Figures) -> list[Finding]:
@@ -153,16 +160,17 @@ def larger_than_noise(full: Problem, fits: FullRate, figures: Figures) -> list[F
             continue
         column = full.columns.get(output.channel, output.channel)
         left = ratio * noise.sigma
-        says = f"The residual of column {column}, {left:.3g} {output.unit} RMS, is {ratio:.2g} times the noise that "
+        says = f"The residual of column {column}, {left:.3g} {output.unit} RMS, is {ratio:.2g} times the noise "
+        says += f"{_that_is_known(noise.source)}. "
         if noise.source.seen_alone:
-            says += "was recorded alone. No effect explains it, and up to "
+            says += "No effect explains it, and up to "
             says += f"{rules.residual_over_noise_nominal:.2g} times may be the simplifications of a model: something small "
             says += "may be missing. Record larger and faster motions, and diagnose again."
             findings.append(Finding("above_noise", column, says))
         else:
-            says += (
-                "its spectrum suggests. The noise was never recorded alone, so this may be slower noise, or a mismatch that "
-            )
-            says += "no effect explains: record some seconds at rest, or the same motion twice."
+            short = noise.source is NoiseSource.SHORT_RESTS
+            says += "The noise is too slow for them" if short else "The noise was never recorded alone"
+            says += ", so this may be slower noise, or a mismatch that no effect explains: record "
+            says += f"{'longer rests' if short else 'some seconds at rest'}, or the same motion twice."
             findings.append(Finding("noise_unseen", column, says))
     return findings

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import (
     FAR,
     Fit,
@@ -29,6 +28,7 @@ from host.diagnosis.estimation.fit import (
     starts,
     tuned,
 )
+from host.diagnosis.estimation.noise import correlation_time
 from host.diagnosis.model.dataset import one_clock
 from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, memory_keys, same_place
 from host.diagnosis.model.model import Segment, scale_of

@@ -93,16 +93,19 @@ def _shows_structure(problem: Problem, fit: Fit, row: int) -> bool:
     """Whether the residual of an output follows something more than noise with its spectrum may do.
 
     Noise of an input does so too, whether it was read with the input or a controller fed it into it. Both get there by a
-    linear law, so all that a linear law makes of the inputs is removed before.
+    linear law, so all that a linear law makes of the inputs, or of simulated outputs, is removed before.
     """
-    rules, inputs = problem.rules, problem.model.quiet_inputs
-    if problem.noise[row].source is not NoiseSource.SPECTRUM or problem.noise_passed > rules.noise_passed_share:
+    rules = problem.rules
+    if (
+        problem.noise[row].source not in (NoiseSource.SPECTRUM, NoiseSource.SHORT_RESTS)
+        or problem.noise_passed > rules.noise_passed_share
+    ):
         return False
     if _made_by_steps(problem, fit, row):
         return False
-    filtered = [shifted([segment.inputs[name] for name in inputs]) for segment in problem.segments]
-    absorbed = [np.vstack(both) for both in zip(_absorbed(problem, fit, row), filtered, strict=True)]
-    return structured([r[row] for r in fit.residuals], _known(problem, fit, slice(None)), absorbed, rules)
+    known = _known(problem, fit, slice(None))
+    absorbed = [np.vstack(both) for both in zip(_absorbed(problem, fit, row), map(shifted, known), strict=True)]
+    return structured([r[row] for r in fit.residuals], known, absorbed, rules)
 
 
 def _made_by_steps(problem: Problem, fit: Fit, row: int) -> bool:

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from host.diagnosis.estimation import noise
-from host.diagnosis.estimation.evidence import compare, correlation_time, whiteness
+from host.diagnosis.estimation.evidence import compare, whiteness
+from host.diagnosis.estimation.noise import correlation_time
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.estimation.uncertainty import _jackknife
 from host.diagnosis.model import readings
