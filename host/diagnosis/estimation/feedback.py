@@ -121,7 +121,6 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
         around = [_around(u, segment.spread) for segment, u in zip(segments, new, strict=True)]
     after, before = [_later(u, HELD) for u in new], [_earlier(u) for u in new]
     after_next = [_later(u, 1) for u in new]  # a rate that is interpolated sees the next sample, and its noise
-    both_sides = [_around(u, LAGS, SAMPLES_PER_LAG // 2) for u in new]
     for segment in segments:
         segment.fed_back = [None] * segment.y.shape[0]
     for row in range(segments[0].y.shape[0]):
@@ -130,7 +129,8 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
         late = _delay(segments, residuals, row, inputs, rules)
         coloured = late is not None and _share([_before(u, late) for u in new], residuals, row) >= rules.feedback_share
         if fed or coloured:
-            for segment, basis in zip(segments, both_sides if coloured else after_next, strict=True):
+            bases = [_around(u, LAGS, SAMPLES_PER_LAG // 2) for u in new] if coloured else after_next
+            for segment, basis in zip(segments, bases, strict=True):
                 segment.fed_back[row] = basis
         if around:
             noisy = noisy or _share(around, residuals, row) > rules.feedback_predicted_share

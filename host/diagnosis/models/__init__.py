@@ -6,7 +6,7 @@ from host.diagnosis.model.model import Model
 from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
 from protocol.errors import InputError
 
-LAW = ("mass", "damping", "stiffness", "offset")  # whose names an axis and an impedance know, also where `terms` has fewer
+LAW = ("mass", "damping", "stiffness", "offset")  # names that an axis and an impedance know; one that `terms` lacks is zero
 
 
 def build(spec: NominalSpec) -> Model:
@@ -21,9 +21,12 @@ def build(spec: NominalSpec) -> Model:
 
         own = [KEYS.get(p.name, p.name) if spec.kind == "rig" else p.name for p in model.parameters]
         accepted = dict.fromkeys([*own, *(LAW if spec.kind in ("axis", "impedance") else ())])
-        for name in spec.parameters:
+        for name, parameter in spec.parameters.items():
             if name not in accepted:
                 raise InputError(f"parameters.{name}", f"no parameter of kind {spec.kind}", "one of " + ", ".join(accepted))
+            if name not in own and parameter.value != 0.0:
+                wanted = f"0, or {name} in {spec.kind}.terms, without which the law has none"
+                raise InputError(f"parameters.{name}", parameter.value, wanted)
     return model
 
 

@@ -221,6 +221,11 @@ PLANT = {
         (STAGE, {"mass": 0.0}, "parameters.mass: found 0.0, wanted a value above 0; leave mass out of axis.terms"),
         (STAGE, {"damping": -1.0}, "parameters.damping: found -1.0, wanted 0 or a value above it"),
         (STAGE, {"masss": 1.0}, "parameters.masss: found .*, wanted one of mass, damping, stiffness, offset"),
+        (
+            STAGE,
+            {"offset": 0.2},
+            "parameters.offset: found 0.2, wanted 0, or offset in axis.terms, without which the law has none",
+        ),
         (PLANT, {"K": 1.0, "tau": 2.0, "taw": 2.0}, "parameters.taw: found .*, wanted one of K, tau"),
     ],
 )
