@@ -55,7 +55,7 @@ def _jumps(r: Array, number: int, rules: SelectionRules, step: float) -> list[Ju
     shift, abrupt = _shift(r, SIDE), _shift(r, NEAR)
     level = 1.4826 * float(np.median(np.abs(shift - np.median(shift)))) + 1e-300
     found: list[Jump] = []
-    least = np.maximum(rules.jump_deviations * np.maximum(level, _scatter(r)), step)
+    least = np.maximum(rules.jump_deviations * np.maximum(level * _unrest(r), _scatter(r)), step)
     left = np.where(np.abs(shift) > least, np.abs(shift), 0.0)
     while left.size and np.max(left) > 0.0 and len(found) <= rules.jumps_per_recording:
         place = int(np.argmax(left))
@@ -77,6 +77,17 @@ def _scatter(r: Array) -> Array:
     steps = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(r)), 2 * SIDE - 1)
     one = 1.4826 / np.sqrt(2.0) * np.median(steps, axis=1)
     return np.asarray(one * np.sqrt(np.pi / SIDE))  # a median of n samples scatters by sqrt(pi / 2n) of one sample
+
+
+def _unrest(r: Array) -> Array:
+    """Spread of the samples on the noisier side of each place of `_shift`, over the usual one, and at least 1.
+
+    Coloured noise that comes in bursts has levels of its own there.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(r, SIDE)
+    spread = np.median(np.abs(windows - np.median(windows, axis=1, keepdims=True)), axis=1)
+    noisier = np.maximum(spread[:-SIDE], spread[SIDE:])
+    return np.asarray(np.maximum(noisier / (np.median(noisier) + 1e-300), 1.0))
 
 
 def _shift(r: Array, side: int) -> Array:

@@ -10,6 +10,7 @@ from scipy import signal
 
 import seldinger as sd
 from host.diagnosis.estimation.coloured import structured
+from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.noise import NoiseSource, estimate, runs
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.readings import scatter, wild
@@ -97,6 +98,18 @@ def test_bursts_of_noise_are_not_a_structure() -> None:
             noise.append(bursts * slow(rng, 2000, 20.0))
         found += structured(noise, inputs, [], RULES)
     assert found <= 1
+
+
+def test_bursts_of_slow_noise_are_not_jumps() -> None:
+    """A level that shifts within a burst is noise; one that shifts and stays is a jump."""
+    seen = 0
+    for seed in range(20):
+        rng = np.random.default_rng([739, seed])
+        bursts = 0.15 + np.convolve(rng.random(1800) < 0.0015, np.ones(30))[:1800]
+        r = bursts * slow(rng, 1800, 5.0)
+        assert not jumps_of([r], RULES)
+        seen += any(abs(jump.sample - 900) <= 3 for jump in jumps_of([r + 10.0 * (np.arange(1800) >= 900)], RULES))
+    assert seen >= 18
 
 
 def test_three_echoes_of_seven_samples_are_outliers_where_echoes_are_frequent() -> None:
