@@ -127,7 +127,7 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
         later, earlier = _share(after, residuals, row), _share(before, residuals, row)
         fed = later >= max(rules.feedback_share, rules.feedback_over_past * earlier)
         late = _delay(segments, residuals, row, inputs, rules)
-        coloured = late is not None and _share([_before(u, late) for u in new], residuals, row) >= rules.feedback_share
+        coloured = late is not None and _predicts_colour([_before(u, late) for u in new], residuals, row, rules)
         if fed or coloured:
             bases = [_around(u, LAGS, SAMPLES_PER_LAG // 2) for u in new] if coloured else after_next
             for segment, basis in zip(segments, bases, strict=True):
@@ -153,6 +153,20 @@ def _delay(
     read = [[segments[k].inputs[name] for name in inputs if name in segments[k].inputs] for k in long]
     usable = bool(lines) and all(read) and all(map(np.any, lines))
     return handed_on(lines, read, rules, sure=True) if usable else None
+
+
+def _predicts_colour(bases: list[Array | None], residuals: list[Array], row: int, rules: SelectionRules) -> bool:
+    """Whether earlier new input, of `bases`, says something of the residual of output `row` and nothing of its innovations.
+
+    Coloured noise is predicted by its own past as well. A mismatch is not: what the input does to it next is new.
+    """
+    if _share(bases, residuals, row) < rules.feedback_share:
+        return False
+    lines = [np.nan_to_num(residual[row]) for residual in residuals]
+    used = [line for line, basis in zip(lines, bases, strict=True) if basis is not None]
+    a = predictor(used, ORDER)
+    new = [np.concatenate((np.zeros(ORDER), innovation(line, a)))[None, :] for line in lines]
+    return _share(bases, new, 0) < rules.feedback_innovation_share
 
 
 def _at_once(

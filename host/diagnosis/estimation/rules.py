@@ -51,6 +51,7 @@ class SelectionRules:
     noise_passed_margin: float = 1.5  # so many times that share, which is estimated
     feedback_share: float = 0.05  # of the residual's variance that later input has to predict, beyond chance,
     feedback_over_past: float = 2.0  # and over what earlier input predicts: that is a wrong model
+    feedback_innovation_share: float = 0.01  # of its innovations' variance that earlier input may predict, if it is coloured
     feedback_over_remainder: float = 2.0  # least ratio of the coefficients on the new part of the input and on the other
     feedback_predicted_share: float = 0.5  # of the new input by the motion so far; of the residual by the new input
     new_input_deviations: float = 5.0  # robust, up to which new input may be noise; more is a step of the set-point
