@@ -107,8 +107,15 @@ def structured(
     rows = [_without_trend(row) for row in rows]
     features = [[_without_trend(_averaged(form, step)) for form in _slow_forms(u)] for u in own_inputs]
     rates = [[_without_trend(_averaged(fill(rate), step)) for rate in absorbed[k]] for k in long if k < len(absorbed)]
+    kept = _left_by([np.concatenate(own) for own in zip(*rates, strict=True)])
+    forms = [np.concatenate(parts) for parts in zip(*features, strict=True)]
+    left = [
+        form for form, whole in zip(map(kept, forms), forms, strict=True) if form @ form > NOT_ABSORBED * (whole @ whole)
+    ]
+    directions, residual = [form / np.linalg.norm(form) for form in left], kept(np.concatenate(rows))
     return all(
-        _p_value(*_of_features(rows, [draw(rng, row) for row in rows], features, rates, rules)) <= significance
+        _p_value(*_along(directions, residual, kept(np.concatenate([draw(rng, row) for row in rows], axis=1)), rules))
+        <= significance
         for draw in (_random_phases, _random_signs)
     )
 
@@ -143,27 +150,20 @@ def _p_value(found: float, by_chance: Array) -> float:
     return float(1 + np.count_nonzero(by_chance >= found)) / (1 + by_chance.size)
 
 
-def _of_features(
-    rows: list[Array], noises: list[Array], tables: list[list[Array]], absorbed: list[list[Array]], rules: SelectionRules
-) -> tuple[float, Array]:
-    """Largest share of the variance that one feature takes, of the residual and of each surrogate (SURROGATES,).
+def _along(directions: list[Array], found: Array, by_chance: Array, rules: SelectionRules) -> tuple[float, Array]:
+    """Largest share of the variance along one of `directions` (n,) of unit length: of a residual and of each surrogate.
 
-    Shares of a feature are relative to the one that a surrogate in twenty exceeds: features have unlike numbers of turns.
+    Shares of a direction are relative to the one that a surrogate in twenty exceeds: features have unlike numbers of turns.
     One that takes less of the residual than an effect has to is not a structure, however rare it is in noise.
+
+    found: residual (n,). by_chance: surrogates (SURROGATES, n).
     """
-    kept = _left_by([np.concatenate(rates) for rates in zip(*absorbed, strict=True)])
-    found, by_chance = kept(np.concatenate(rows)), kept(np.concatenate(noises, axis=1))
     power, powers = float(found @ found) + 1e-300, np.sum(by_chance * by_chance, axis=1) + 1e-300
     largest, largest_by_chance = 0.0, np.zeros(len(powers))
-    for parts in zip(*tables, strict=True):
-        whole = np.concatenate(parts)
-        feature = kept(whole)
-        size = float(feature @ feature)
-        if not size > NOT_ABSORBED * float(whole @ whole):
-            continue
-        shares = (by_chance @ feature) ** 2 / (size * powers)
+    for direction in directions:
+        shares = (by_chance @ direction) ** 2 / powers
         usual = float(np.quantile(shares, 0.95)) + 1e-12
-        share = float(found @ feature) ** 2 / (size * power)
+        share = float(found @ direction) ** 2 / power
         if share > rules.least_excess_reduction:
             largest = max(largest, share / usual)
         largest_by_chance = np.maximum(largest_by_chance, shares / usual)

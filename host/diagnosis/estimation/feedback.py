@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.noise import innovation, innovations, predictor
+from host.diagnosis.estimation.noise import innovations, prediction_error, predictor
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import fill
@@ -100,7 +100,7 @@ def _new_alone(lines: list[Array], read: list[Array], new: list[Array], late: in
     """
     parts = [[r[: r.size - late], z[late:], (u - z)[late:]] for r, u, z in zip(lines, read, new, strict=True)]
     a = predictor([r for r, _, _ in parts], ORDER)
-    white = [np.array([innovation(x - np.mean(x), a) for x in part]) for part in parts]
+    white = [np.array([prediction_error(x - np.mean(x), a) for x in part]) for part in parts]
     e, z, held = np.concatenate(white, axis=1)
     by_new, by_held = np.linalg.lstsq(np.column_stack((z, held)), e, rcond=1e-12)[0]
     return bool(abs(by_new) >= rules.feedback_over_remainder * abs(by_held))
@@ -165,7 +165,7 @@ def _predicts_colour(bases: list[Array | None], residuals: list[Array], row: int
     lines = [np.nan_to_num(residual[row]) for residual in residuals]
     used = [line for line, basis in zip(lines, bases, strict=True) if basis is not None]
     a = predictor(used, ORDER)
-    new = [np.concatenate((np.zeros(ORDER), innovation(line, a)))[None, :] for line in lines]
+    new = [prediction_error(line, a)[None, :] for line in lines]
     return _share(bases, new, 0) < rules.feedback_innovation_share
 
 

@@ -245,7 +245,7 @@ def autoregression(lags: Array) -> Array:
 def innovations(lines: list[Array], order: int) -> list[Array]:
     """Innovations (n_i - order,) of one autoregression of all recordings, in robust standard deviations."""
     a = predictor(lines, order)
-    new = [innovation(r, a) for r in lines]
+    new = [prediction_error(r, a)[order:] for r in lines]
     together = np.concatenate(new)
     spread = 1.4826 * float(np.median(np.abs(together - np.median(together)))) + 1e-300
     return [e / spread for e in new]
@@ -256,10 +256,14 @@ def predictor(lines: list[Array], order: int) -> Array:
     return autoregression(np.array([sum(float(r[: r.size - k] @ r[k:]) for r in lines) for k in range(order + 1)]))
 
 
-def innovation(x: Array, ar: Array) -> Array:
-    """What `x` (n,) does beyond its prediction by the coefficients `ar` (p,) from its last p samples: (n - p,)."""
-    past = np.lib.stride_tricks.sliding_window_view(x[:-1], ar.size)
-    return np.asarray(x[ar.size :] - past @ ar[::-1])
+def prediction_error(x: Array, weights: Array) -> Array:
+    """What the p samples before each of `x` (n,) do not predict of it: (n,), of which the first p are zero.
+
+    weights: (p,), of the nearest sample first.
+    """
+    error = x - np.convolve(x, np.concatenate(([0.0], weights)))[: x.size]
+    error[: weights.size] = 0.0
+    return np.asarray(error)
 
 
 def correlation_time(r: Array, longest: int | None = None) -> float:

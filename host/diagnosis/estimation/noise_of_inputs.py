@@ -19,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.estimation.noise import prediction_error
 from host.diagnosis.model.model import Model, Segment
 from host.diagnosis.model.operators import fill, reading_noise
 
@@ -44,13 +45,13 @@ def noise_through(model: Model, segment: Segment, theta: Array) -> Array:
         if u.size < LEAST or sigma <= 0.0:
             continue
         weights = _best_predictor(u)
-        usual, z = sigma * float(np.sqrt(1.0 + weights @ weights)), _unpredicted(u, weights)
+        usual, z = sigma * float(np.sqrt(1.0 + weights @ weights)), prediction_error(u, weights)
         if _missed(u, weights) > MOST * usual:
             continue
         near = np.abs(z) < FAR * usual
         calm &= near
         noise[name] = sigma * rng.standard_normal(u.size)
-        innovation[name], drawn_innovation[name] = np.where(near, z, 0.0), _unpredicted(noise[name], weights)
+        innovation[name], drawn_innovation[name] = np.where(near, z, 0.0), prediction_error(noise[name], weights)
     out = np.zeros(len(model.outputs))
     if not noise:
         return out
@@ -68,7 +69,7 @@ def noise_through(model: Model, segment: Segment, theta: Array) -> Array:
             continue
         filled = fill(e)
         weights = _best_predictor(filled)
-        fast = [_unpredicted(signal, weights)[used] for signal in (filled, r, w, own)]
+        fast = [prediction_error(signal, weights)[used] for signal in (filled, r, w, own)]
         expected = float(np.mean(fast[2] * fast[3]))
         if expected != 0.0:
             share = -float(np.mean(fast[0] * fast[1])) / expected
@@ -92,11 +93,4 @@ def _best_predictor(u: Array) -> Array:
 
 def _missed(u: Array, weights: Array) -> float:
     """Standard deviation of what a predictor misses of `u` (n,), robust against jumps."""
-    return 1.4826 * float(np.median(np.abs(_unpredicted(u, weights)[weights.size :])))
-
-
-def _unpredicted(u: Array, weights: Array) -> Array:
-    """What the samples before each do not predict of it (n,); zero of the first ones, that have too few before them."""
-    z = u - np.convolve(u, np.concatenate(([0.0], weights)))[: u.size]
-    z[: weights.size] = 0.0
-    return np.asarray(z)
+    return 1.4826 * float(np.median(np.abs(prediction_error(u, weights)[weights.size :])))

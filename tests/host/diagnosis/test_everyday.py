@@ -20,6 +20,7 @@ from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import inspected
 from host.diagnosis.selection.posterior import posterior
 from host.diagnosis.selection.trial import vanished
+from tests.host.proof.everyday import first_order_nominal
 
 Array = np.ndarray
 GEAR = {
@@ -257,21 +258,7 @@ def looped(number: int) -> dict[str, Array]:
 
 
 def test_noise_that_a_controller_answers_in_the_same_row_is_no_coupling() -> None:
-    nominal = {
-        "name": "motor",
-        "kind": "linear",
-        "data": {"time": "t"},
-        "channels": {"drive": {"column": "u", "unit": "V"}, "speed": {"column": "y", "unit": "rad/s"}},
-        "linear": {
-            "inputs": ["drive"],
-            "outputs": ["speed"],
-            "subsystem": "motor",
-            "numerator": ["gain"],
-            "denominator": ["tau", 1.0],
-            "hold": "zero",
-        },
-        "parameters": {"gain": 1.5, "tau": 0.2},
-    }
+    nominal = first_order_nominal("V", "rad/s", gain=1.5, tau=0.2)
     content = diagnose([looped(k) for k in (1, 2)], nominal).as_dict()
     assert content["verdict"] == "nothing_missing" and content["effects"] == []
 

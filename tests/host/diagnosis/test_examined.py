@@ -16,6 +16,8 @@ from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.operators import least_error_window, smooth_derivatives
 from host.diagnosis.selection.posterior import posterior
+from tests.host.proof import everyday
+from tests.host.proof.everyday import first_order_nominal
 
 pytestmark = pytest.mark.slow  # together: each takes some seconds
 
@@ -28,21 +30,7 @@ LINK: dict[str, Any] = {
     "link": [{"subsystem": "link", "input": "drive", "output": "slide"}],
     "parameters": {"gain": 1.0},
 }
-HEATER: dict[str, Any] = {
-    "name": "heater",
-    "kind": "linear",
-    "data": {"time": "t"},
-    "channels": {"power": {"column": "u", "unit": "W"}, "rise": {"column": "y", "unit": "K"}},
-    "linear": {
-        "inputs": ["power"],
-        "outputs": ["rise"],
-        "numerator": ["gain"],
-        "denominator": ["tau", 1.0],
-        "hold": "zero",
-        "subsystem": "block",
-    },
-    "parameters": {"gain": 0.7, "tau": 5.0},
-}
+HEATER = first_order_nominal("W", "K", gain=0.7, tau=5.0)
 MOUNT: dict[str, Any] = {
     "name": "mount",
     "kind": "impedance",
@@ -159,10 +147,7 @@ def test_coloured_noise_is_told_from_physics(seed: int) -> None:
 
 
 def wander(seed: int, n: int, samples: float) -> Array:
-    """First-order noise of unit standard deviation, correlated over so many samples."""
-    kicks = np.random.default_rng([109, seed]).standard_normal(n + int(10 * samples))
-    keep = np.exp(-1.0 / samples)
-    return signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], kicks)[-n:]
+    return everyday.wander(np.random.default_rng([109, seed]), n, samples)
 
 
 def wandering(seed: int) -> list[dict[str, Array]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy import signal
@@ -14,28 +12,10 @@ from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.noise import NoiseSource, estimate, runs
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.readings import scatter, wild
+from tests.host.proof.everyday import first_order_nominal, wander
 
 Array = np.ndarray
-PLANT: dict[str, Any] = {
-    "name": "plant",
-    "kind": "linear",
-    "data": {"time": "t"},
-    "channels": {"drive": {"column": "u", "unit": "1"}, "reading": {"column": "y", "unit": "1"}},
-    "linear": {
-        "inputs": ["drive"],
-        "outputs": ["reading"],
-        "numerator": ["gain"],
-        "denominator": ["tau", 1.0],
-        "hold": "zero",
-    },
-    "parameters": {"gain": 1.0, "tau": 1.0},
-}
-
-
-def slow(rng: np.random.Generator, n: int, samples: float) -> Array:
-    """First-order noise of unit standard deviation, correlated over so many samples."""
-    keep = np.exp(-1.0 / samples)
-    return signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(n + int(10 * samples)))[-n:]
+PLANT = first_order_nominal("1", "1", gain=1.0, tau=1.0)
 
 
 def regulated(rng: np.random.Generator, noise: Array, late: int) -> tuple[Array, Array]:
@@ -58,7 +38,7 @@ def test_slow_noise_in_a_loop_is_not_a_mismatch(seed: int, late: int) -> None:
     recordings = []
     for k in range(3):
         rng = np.random.default_rng([701, seed, k])
-        u, y = regulated(rng, 0.02 * slow(rng, 1200, 6.0), late)
+        u, y = regulated(rng, 0.02 * wander(rng, 1200, 6.0), late)
         recordings.append({"t": 0.05 * np.arange(u.size), "u": u, "y": y})
     assert sd.diagnose(recordings, PLANT).verdict == "nothing_missing"
 
@@ -71,7 +51,7 @@ def test_noise_slower_than_the_rests_is_not_a_mismatch(seed: int) -> None:
         rng = np.random.default_rng([709, seed, k])
         u = np.concatenate([np.full(int(rng.integers(40, 75)), rng.normal(0.0, 1.0)) for _ in range(11)])
         y = signal.lfilter([0.0, 1.0 - np.exp(-0.1 / 3.0)], [1.0, -np.exp(-0.1 / 3.0)], 2.0 * u)
-        recordings.append({"t": 0.1 * np.arange(u.size), "u": u, "y": y + 0.05 * slow(rng, u.size, 70.0)})
+        recordings.append({"t": 0.1 * np.arange(u.size), "u": u, "y": y + 0.05 * wander(rng, u.size, 70.0)})
     assert sd.diagnose(recordings, PLANT).verdict == "nothing_missing"
 
 
@@ -82,7 +62,7 @@ def test_a_level_is_measured_in_rests_that_are_long_for_the_noise(samples: float
     rng = np.random.default_rng(719)
     still = [(np.arange(6000) % (2 * rest)) < rest]
     assert len(runs(still[0], 30)) >= 2
-    found = estimate([slow(rng, 6000, samples)], still)
+    found = estimate([wander(rng, 6000, samples)], still)
     assert found.source is NoiseSource[source]
     assert (found.sigma < 0.8) is (found.source is NoiseSource.SHORT_RESTS)
 
@@ -95,7 +75,7 @@ def test_bursts_of_noise_are_not_a_structure() -> None:
         for _ in range(2):
             bursts = 0.02 + np.convolve(rng.random(2000) < 0.001, np.ones(40))[:2000]
             inputs.append([np.cumsum(np.convolve(rng.random(2000) < 0.001, np.ones(40))[:2000])])
-            noise.append(bursts * slow(rng, 2000, 20.0))
+            noise.append(bursts * wander(rng, 2000, 20.0))
         found += structured(noise, inputs, [], RULES)
     assert found <= 1
 
@@ -106,7 +86,7 @@ def test_bursts_of_slow_noise_are_not_jumps() -> None:
     for seed in range(20):
         rng = np.random.default_rng([739, seed])
         bursts = 0.15 + np.convolve(rng.random(1800) < 0.0015, np.ones(30))[:1800]
-        r = bursts * slow(rng, 1800, 5.0)
+        r = bursts * wander(rng, 1800, 5.0)
         assert not jumps_of([r], RULES)
         seen += any(abs(jump.sample - 900) <= 3 for jump in jumps_of([r + 10.0 * (np.arange(1800) >= 900)], RULES))
     assert seen >= 18

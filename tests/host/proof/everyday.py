@@ -131,6 +131,12 @@ def spring(number: int, coulomb_N: float = 0.0, mass_kg: float = 0.0) -> Columns
     return {"t": t, "x": x, "f": force + 0.02 * rng.standard_normal(t.size)}
 
 
+def wander(rng: np.random.Generator, n: int, samples: float) -> Array:
+    """First-order noise (n,) of unit standard deviation, correlated over so many samples."""
+    kicks, keep = rng.standard_normal(n + int(10 * samples)), np.exp(-1.0 / samples)
+    return np.asarray(lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], kicks)[-n:])
+
+
 def oven(number: int) -> Columns:
     """Heater power in steps (W), and the temperature behind a first-order lag of 180 s, every 5 s for an hour."""
     rng, t = stream(number), np.arange(0.0, 3600.0, 5.0)
@@ -199,6 +205,25 @@ def gear_nominal(**parameters: Any) -> dict[str, Any]:
         "channels": {"motor": {"column": "motor", "unit": "rad"}, "load": {"column": "load", "unit": "rad"}},
         "link": [{"subsystem": "gear", "input": "motor", "output": "load"}],
         "parameters": parameters,
+    }
+
+
+def first_order_nominal(input_unit: str, output_unit: str, gain: float, tau: float) -> dict[str, Any]:
+    """Nominal model of a plant of first order (gain, time constant in s) whose input is held."""
+    return {
+        "name": "plant",
+        "kind": "linear",
+        "data": {"time": "t"},
+        "channels": {"u": {"column": "u", "unit": input_unit}, "y": {"column": "y", "unit": output_unit}},
+        "linear": {
+            "subsystem": "plant",
+            "inputs": ["u"],
+            "outputs": ["y"],
+            "numerator": ["gain"],
+            "denominator": ["tau", 1.0],
+            "hold": "zero",
+        },
+        "parameters": {"gain": gain, "tau": tau},
     }
 
 
