@@ -61,7 +61,7 @@ from host.diagnosis.selection.remarks import (
     slow_noise,
     times_noise,
 )
-from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
+from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample, lead_instead
 from host.diagnosis.selection.search import concluded, forward, search
 from host.diagnosis.selection.trial import Trial, within_sample
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs, structured_outputs
@@ -308,6 +308,7 @@ def _diagnosed(
         *noise_of_motion(problem),
         *read_seldom(full),
         *between,
+        *lead_instead(problem, found, standing),
         *idle_inputs(problem, found.best),
         *uncertain(problem, found.best, spans),
         *model.findings(),
@@ -330,7 +331,9 @@ def _diagnosed(
         result.findings += lines_in_spectrum(full, fits)
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best)
-        late = any(finding.id == "within_sample" for finding in done.findings)  # it explains what exceeds the noise
+        late = any(
+            finding.id in ("within_sample", "clock") for finding in done.findings
+        )  # it explains what exceeds the noise
         result.findings += slow_noise(full, fits, slow) or ([] if late else larger_than_noise(full, fits, figures))
     known = between or any(finding.id in ("jump", "line") for finding in result.findings)
     if result.verdict == "mismatch_not_identified" and not found.best.terms and not known:
@@ -509,14 +512,15 @@ def _past_delay(again: _Again, late: Trial, begun: _Searched) -> _Searched | Non
     extended = again.spec.model_copy(update={"effect": [*again.spec.effect, known]})
     model, second, full = problems(extended, again.recordings, problem.rules)
     second.budget, second.joint_states = problem.budget, problem.joint_states
-    for each in (second, full):
+    for each in (second, full) if model.holds else ():
         model.hold_as(each.segments, problem.model.hold)
-    others = [c for c in again.candidates if not (c.effect.shifts and c.port.held)]
-    found = search(second, others, again.progress, late.both.log_likelihood)
     place = {*candidate.port.path, candidate.port.name}
+    others = [c for c in again.candidates if not (c.effect.shifts and (c.port.held or c.port.name in place))]
+    found = search(second, others, again.progress, late.both.log_likelihood)
     own = [t for t in found.best.terms if not (t.candidate.effect.invariant and t.candidate.port.name in place)]
     delay_s = found.best.values[len(problem.model.parameters) : len(model.parameters)]
-    if not own or float(np.sum(np.abs(delay_s))) > problem.rules.sampling_delay * problem.segments[0].recording.dt_s:
+    late_s = float(np.max(delay_s, initial=0.0))
+    if not own or late_s > problem.rules.sampling_delay * problem.segments[0].recording.dt_s:
         return None
     before, rules = late.fit.residuals, problem.rules
     ahead = problem.gain("both", before, found.best.residuals).log_likelihood

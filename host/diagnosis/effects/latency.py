@@ -8,19 +8,19 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 from host.diagnosis.model.operators import shift, shifted_rows
 
 LONGEST = 0.25  # of the recording
+EARLIEST = 8.0  # samples by which a channel may come first; what comes earlier is found before (`clock_lead_samples`)
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Delay: causal, and no longer than leaves most of the recording to compare.
+    """Delay: no longer than leaves most of the recording to compare, and shorter than zero by two samples at most.
 
-    At a held input the output may be up to one sample early: an integrator that moves the place with the speed of the end
-    of each step is. Such a lead is a matter of sampling and is not named.
+    No law answers an input that is yet to come, so a lead is never named. It is a matter of the recording: of clocks, of
+    filters of the sensors, of an integrator that moves the place with the speed of the end of each step.
     """
     longest = LONGEST * s.duration_s
     delays = (0.05 * s.dt_s, 0.4 * s.dt_s, 2.0 * s.dt_s, *spread(6.0 * s.dt_s, max(0.5 * longest, 7.0 * s.dt_s), 7))
-    earliest = -s.dt_s if s.held else 0.0
-    leads = (-0.4 * s.dt_s, -0.05 * s.dt_s) if s.held else ()
-    return (Parameter("delay", "s", (*leads, *delays), earliest, longest, step=s.dt_s, dead_time=True),)
+    leads = (-6.0 * s.dt_s, -2.5 * s.dt_s, -1.0 * s.dt_s, -0.4 * s.dt_s, -0.05 * s.dt_s)
+    return (Parameter("delay", "s", (*leads, *delays), -EARLIEST * s.dt_s, longest, step=s.dt_s, dead_time=True),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

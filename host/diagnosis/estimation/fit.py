@@ -169,12 +169,17 @@ class Problem:
         return min(late, segment.n // 2) if late_s > 0.0 else 0
 
     def early_s(self, terms: tuple[Term, ...], values: Array) -> float:
-        """Time (s) by which clocks that run faster are ahead at the end of a recording, at most."""
-        return max((_ahead_s(segment, terms, values) for segment in self.segments if segment.fit.any()), default=0.0)
+        """Time (s) by which leads, and clocks that run faster, are ahead at the end of a recording, at most."""
+        used = [segment for segment in self.segments if segment.fit.any()]
+        return self.lead_s(terms, values) + max((_ahead_s(segment, terms, values) for segment in used), default=0.0)
+
+    def lead_s(self, terms: tuple[Term, ...], values: Array) -> float:
+        """Lead of all terms together (s): dead times below zero."""
+        return sum(max(-float(value), 0.0) for p, value in zip(self.parameters(terms), values, strict=True) if p.dead_time)
 
     def ends(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> int:
-        """Last samples (number) that a clock which runs faster makes of what came after the recording."""
-        early_s = max(_ahead_s(segment, terms, values), self.ends_s)
+        """Last samples (number) that a lead, or a clock which runs faster, makes of what came after the recording."""
+        early_s = max(self.lead_s(terms, values) + _ahead_s(segment, terms, values), self.ends_s)
         return min(math.ceil(early_s / segment.recording.dt_s - 1e-9), segment.n // 2) if early_s > 0.0 else 0
 
     def left(self, segment: Segment, terms: tuple[Term, ...], values: Array, out: Array | None = None) -> Array:
@@ -418,8 +423,8 @@ def minimize(
 ) -> Fit:
     """Values that minimize the Huber cost of the weighted simulation error, from `start`.
 
-    A dead time hides the first samples, a clock that runs faster the last ones. How many is held while they are fitted: the
-    cost would jump with each of them.
+    A dead time hides the first samples, a lead and a clock that runs faster the last ones. How many is held while they are
+    fitted: the cost would jump with each of them.
     states: whether initial states follow the values tried; they are not changed, the caller estimates them again.
     """
     late = any(p.dead_time for term in terms for p in term.parameters)
@@ -428,7 +433,8 @@ def minimize(
         dt_s = problem.segments[0].recording.dt_s
         for _ in range(3):
             waits_s = WAIT * problem.late_s(terms, start) + 3.0 * dt_s if late else 0.0
-            ends_s = WAIT * problem.early_s(terms, start) + 3.0 * dt_s if drifts else 0.0
+            early_s = problem.early_s(terms, start)
+            ends_s = WAIT * early_s + 3.0 * dt_s if drifts or early_s > 0.0 else 0.0
             held = replace(problem, waits_s=waits_s, ends_s=ends_s)
             fit = minimize(held, terms, start, rounds, tolerance, states)
             fit.cost /= max(held.seen_share(terms, start), 1e-3)  # that a longer dead time gains nothing by hiding samples

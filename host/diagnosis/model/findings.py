@@ -8,6 +8,7 @@ is never changed. A channel that says nothing (constant, all missing) leaves not
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -18,7 +19,7 @@ from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.dataset import Recording, named_apart
 from host.diagnosis.model.frozen import frozen_finding, frozen_readings, without_runs
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import fill, reading_noise
+from host.diagnosis.model.operators import fill, later, reading_noise
 from host.diagnosis.model.pairs import (
     LawFit,
     Pair,
@@ -120,9 +121,17 @@ class _Inspection:
         """Put each of two channels in the place of the other, in every recording."""
         self.recordings = [_exchanged(recording, one, other) for recording in self.recordings]
 
-    def shift_back(self, name: str, lead: int) -> None:
-        """Put the values of channel `name` `lead` samples later, in every recording; its first samples are missing."""
-        self.change(name, lambda values: np.concatenate((np.full(lead, np.nan), values[:-lead])))
+    def shift_back(self, name: str, lead: float) -> None:
+        """Put the values of channel `name` `lead` samples later, in every recording; its first samples are missing.
+
+        A part of a sample is what all other channels are put later by, past the next whole one: an interpolated reading of
+        what is driven would have less noise.
+        """
+        whole = math.ceil(lead)
+        self.change(name, lambda values: np.concatenate((np.full(whole, np.nan), values[:-whole])))
+        if whole > lead:
+            for other in {other for recording in self.recordings for other in recording.channels} - {name}:
+                self.change(other, lambda values: later(values, whole - lead, smooth=not held_levels(values, self.rules)))
 
     def dead(self, vital: set[str]) -> None:
         """Channels that say nothing; only recordings are left in which every vital one is measured and moves."""
@@ -314,9 +323,9 @@ class _Inspection:
     def clock_by_gain(self, path: Pair) -> None:
         """An output that comes before its input: clocks disagree; it is shifted back."""
         leads = [lead_by_gain(recording, path, self.rules) for recording in self.recordings if recording.timed]
-        if not leads or min(leads) < self.rules.clock_lead_samples:
+        if not leads or round(min(leads)) < self.rules.clock_lead_samples:
             return
-        lead = round(float(np.median(leads)))
+        lead = float(np.median(leads))
         early, output_column = f"{lead * self.recordings[0].dt_s:.3g} s", self.columns[path.output]
         says = f"Column {output_column} moves {early} before column {self.columns[path.input]} that drives it: "
         says += "their clocks disagree, or the columns are exchanged. The diagnosis continues with it shifted back."
@@ -385,11 +394,14 @@ class _Inspection:
         nothing but the noise of the force, and to be the same in every recording.
         """
         driven, driver = (path.input, path.output) if self.spec.impedance is not None else (path.output, path.input)
-        leads = [lead_by_law(recording, path, driven, self.rules) for recording in self.long_enough()]
-        lead = round(float(np.median(leads))) if leads else 0
-        if not leads or min(leads) < self.rules.clock_lead_samples or max(leads) - min(leads) > 1 + lead // 10:
+        recordings = self.long_enough()
+        leads = [lead_by_law(recording, path, driven, self.rules) for recording in recordings]
+        lead = float(np.median(leads)) if leads else 0.0
+        if not leads or round(min(leads)) < self.rules.clock_lead_samples or np.ptp(np.round(leads)) > 1 + lead // 10:
             return
-        early, column = f"{lead * self.recordings[0].dt_s:.3g} s", self.columns[driven]
+        if self.spec.impedance is None:  # a force may be held between its samples
+            lead = float(round(lead))
+        early, column = f"{lead * recordings[0].dt_s:.3g} s", self.columns[driven]
         says = f"Column {column} comes {early} before column {self.columns[driver]}, which drives it: with that shift the "
         says += "nominal law leaves only noise. Their clocks disagree. "
         says += f"The diagnosis continues with {column} shifted back."

@@ -377,6 +377,20 @@ def fill(values: Array) -> Array:
     return np.interp(index, index[good], values[good])
 
 
+def later(values: Array, part: float, smooth: bool = True) -> Array:
+    """`values` (n,) put later by a part of a sample (0 to 1): by a spline, or by a line for what is held between samples.
+
+    A missing sample makes both samples missing that are made of it; the first sample is repeated.
+    """
+    from scipy.interpolate import CubicSpline
+
+    line = (1.0 - part) * values + part * np.concatenate((values[:1], values[:-1]))
+    if not smooth or not np.isfinite(values).any():
+        return line
+    at = np.arange(values.size)
+    return np.where(np.isfinite(line), CubicSpline(at, fill(values))(at - part), np.nan)
+
+
 def signal_band(x: Array, dt_s: float, sigma: float) -> float:
     """Frequency (Hz) at which the power of the motion `x` (n,) falls to three times that of white noise `sigma`."""
     from scipy.signal import medfilt, welch

@@ -11,6 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
+from scipy.signal import savgol_coeffs
 
 from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.dataset import Recording
@@ -84,7 +87,10 @@ def explained_by_gain(recordings: list[Recording], input: str, output: str) -> f
 
 
 def lead_by_gain(recording: Recording, path: Pair, rules: DataRules) -> float:
-    """Samples by which the output comes before the input, by the residual of a gain at each shift; 0 if it does not."""
+    """Samples by which the output comes before the input, by the residual of a gain at each shift; 0 if it does not.
+
+    Both are smoothed alike to find a part of a sample: an interpolated reading has less noise.
+    """
     x, y = fill(recording.channels[path.input]), fill(recording.channels[path.output])
     most = min(x.size // 10, 200)
     if most < rules.clock_lead_samples + 1:
@@ -92,7 +98,14 @@ def lead_by_gain(recording: Recording, path: Pair, rules: DataRules) -> float:
     leads = [_left(x[lag:], y[: y.size - lag]) for lag in range(most)]
     lags = [_left(x[: x.size - lag], y[lag:]) for lag in range(most)]  # merely late, it would do no worse that way
     best = int(np.argmin(leads))
-    return float(best) if leads[best] < rules.clock_residual_ratio * min(leads[0], *lags) else 0.0
+    if best == 0 or not leads[best] < rules.clock_residual_ratio * min(leads[0], *lags):
+        return 0.0
+    dt = recording.dt_s
+    window = smoothing_window(x, dt, white_level(x), 7 * dt)
+    smooth_x, smooth_y = (smooth_derivatives(signal, dt, window)[0] for signal in (x, y))
+    line, at = CubicSpline(np.arange(x.size), smooth_x), np.arange(x.size - best - 1)
+    near = (best - 1, best + 1)
+    return float(minimize_scalar(lambda lead: _left(line(at + lead), smooth_y[at]), bounds=near, method="bounded").x)
 
 
 def _left(x: Array, y: Array) -> float:
@@ -317,32 +330,46 @@ def _from_stated(path: Pair, fits: list[LawFit]) -> Array:
     return np.asarray(np.abs(np.log(np.maximum(found, 1e-300) / stated[stated > 0.0])))
 
 
-def lead_by_law(recording: Recording, path: Pair, leading: str, rules: DataRules) -> int:
-    """Samples by which `leading` comes first, by what the law leaves at each shift of it; 0 if it does not."""
+def lead_by_law(recording: Recording, path: Pair, leading: str, rules: DataRules) -> float:
+    """Samples by which `leading` comes first, by what the law leaves at each shift of it; 0 if it does not.
+
+    A force is compared as it was read, and smoothed as its motion is. As read, slow noise of the force passes for noise.
+    Smoothed, it shows a part of a sample and tolerates what smoothing takes from the motion.
+    """
     part = slice(0, LONGEST_FOR_CLOCK)
     force, motion = fill(recording.channels[path.input])[part], fill(recording.channels[path.output])[part]
     dt, noise = recording.dt_s, white_level(force)
     most = min(force.size // 10, 200)
     window = smoothing_window(motion, dt, white_level(motion), 7 * dt)
     if most < rules.clock_lead_samples + 1 or force.size < 4 * window + 4 * most:
-        return 0
+        return 0.0
     rows = _terms(path, motion, dt, window)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True) + 1e-300
     edge = most + window
     middle = rows[:, edge:-edge].T
     gram = np.linalg.pinv(middle.T @ middle, rcond=1e-10, hermitian=True)
 
-    def left(shift: int, signal: Array = force) -> float:
-        """RMS that the law leaves of a force that comes `shift` samples later than its motion."""
-        f = signal[edge + shift : signal.size - edge + shift]
+    def left(f: Array) -> float:
+        """RMS that the law leaves of the force `f` (samples in the middle,)."""
         return float(np.sqrt(np.mean((f - middle @ (gram @ (middle.T @ f))) ** 2)))
 
-    now, clean, ratio = left(0), rules.clock_over_noise * noise, rules.clock_residual_ratio
-    if ratio * now < clean:
-        return 0
+    def shifted(signal: Array, shift: int) -> float:
+        """RMS that the law leaves of a force that comes `shift` samples later than its motion."""
+        return left(signal[edge + shift : signal.size - edge + shift])
+
+    smooth, passed = smooth_derivatives(force, dt, window)[0], float(np.linalg.norm(savgol_coeffs(window, 3)))
+    ratio, over = rules.clock_residual_ratio, rules.clock_over_noise
+    levels = [(force, over * noise), (smooth, over * passed * noise)]
+    if all(clean > ratio * shifted(signal, 0) for signal, clean in levels):
+        return 0.0
     side = -1 if leading == path.input else 1  # a force that comes first is found before its motion
-    after = min(left(-side * lag) for lag in range(0, most, 2))
     # A damping takes over a part of a shift. Only a force that is smoothed as its motion is finds the whole of it.
-    smooth = smooth_derivatives(force, dt, window)[0]
-    best = int(np.argmin([left(side * lead, smooth) for lead in range(most)]))
-    return best if left(side * best) < min(clean, ratio * now, ratio * after) else 0
+    whole = int(np.argmin([shifted(smooth, side * lead) for lead in range(most)]))
+    line, at = CubicSpline(np.arange(force.size), smooth), np.arange(edge, force.size - edge)
+    near = (max(whole - 1, 0), min(whole + 1, most))
+    best = minimize_scalar(lambda lead: left(line(at + side * lead)), bounds=near, method="bounded")
+    for (signal, clean), after in zip(levels, (shifted(force, side * whole), best.fun), strict=True):
+        others = min(shifted(signal, -side * lag) for lag in range(0, most, 2))
+        if after < min(clean, ratio * shifted(signal, 0), ratio * others):
+            return float(best.x)
+    return 0.0

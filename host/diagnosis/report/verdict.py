@@ -29,6 +29,7 @@ UNDECIDED = (
     "noise_unseen",
     "above_noise",
     "within_sample",
+    "lead",
     "excitation",
 )
 REMARKS = (

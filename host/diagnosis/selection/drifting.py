@@ -64,8 +64,11 @@ def drifting(problem: Problem, found: Found) -> list[Finding]:
     more = drift.fit.fitted + KNOTS - 1 - best.fitted
     held = problem.gain("heldout", best.residuals, residuals)
     both = problem.gain("both", best.residuals, residuals)
+    alone = problem.gain("heldout", drift.fit.residuals, residuals)  # of the course, without the effect that it is one of
     least = rules.heldout_log_likelihood + rules.parameter_penalty * max(more, 0)
-    better = held.share > rules.refinement_error_reduction and held.p_value < rules.significance
+    better = all(
+        gain.share > rules.refinement_error_reduction and gain.p_value < rules.significance for gain in (held, alone)
+    )
     if better and held.log_likelihood > rules.heldout_log_likelihood and both.log_likelihood > least:
         return [_said(problem, found, drift, residuals)]
     return []

@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 
 from host.diagnosis.estimation.fit import Fit, Problem, jacobian, minimize, size_of
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.model import Model, Segment
-from host.diagnosis.model.operators import fill
+from host.diagnosis.model.operators import fill, later
 from host.diagnosis.model.readings import Finding
 from host.diagnosis.selection.refits import fit_nominal, settle, settled, try_fit
 from host.diagnosis.selection.screening import enough, screen
@@ -284,9 +283,7 @@ def _put_later(problem: Problem, recording: Recording, channel: str, samples: fl
             padded = np.concatenate((np.full(max(whole, 0), np.nan), values))
             moved[name] = padded[kept.start - min(whole, 0) :][: kept.stop - kept.start]
         elif rest > 0.0 and np.isfinite(values).any():
-            line = (1.0 - rest) * values + rest * np.concatenate((values[:1], values[:-1]))
-            spline = CubicSpline(np.arange(n), fill(values))(np.arange(n) - rest) if smooth else line
-            moved[name] = np.where(np.isfinite(line), spline, np.nan)[kept]
+            moved[name] = later(values, rest, smooth)[kept]
         else:
             moved[name] = values[kept]
     return replace(

@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.readings import Finding
+from host.diagnosis.selection.equivalence import Standing
+from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.refits import fit_nominal, try_fit
 from host.diagnosis.selection.screening import screen
-from host.diagnosis.selection.trial import Trial, leads
+from host.diagnosis.selection.trial import Trial, lead_of, leads
 
 
 def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates: Sequence[Candidate]) -> list[Finding]:
@@ -72,17 +74,46 @@ def _late(problem: Problem, hold: str, candidates: Sequence[Candidate]) -> Fit:
 
 
 def late_by_a_sample(problem: Problem, late: Trial, past: bool = False) -> list[Finding]:
-    """Say that a delay within one sample explains a mismatch and is not named. past: it was searched on with it."""
+    """Say that a delay within one sample, or a lead, explains a mismatch and is not named.
+
+    past: it was searched on with it.
+    """
     period_s, port = problem.segments[0].recording.dt_s, late.candidate.port
-    shift = "lead" if leads(late) else "delay"
-    says = (
-        f"A {shift} of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {late.both.share:.0%} "
-    )
-    says += "of the squared error. No effect is named for it: these recordings cannot separate a delay or lag of this size "
-    says += "from the way in which the input is held between samples, recorded or simulated. "
-    says += (
-        f"The diagnosis continues with this {shift}."
-        if past
-        else "Record at a higher rate, or shift that column by one sample."
-    )
-    return [Finding("within_sample", problem.columns.get(port.channels[0], port.channels[0]), says)]
+    place, removed = port.name.replace("_", " "), f"removes {late.both.share:.0%} of the squared error. "
+    lead_s = lead_of(late)
+    if lead_s > 0.0:
+        says = (
+            f"The recordings are {lead_s:.3g} s ({lead_s / period_s:.2g} samples) ahead of the nominal model at {place}: a "
+        )
+        says += (
+            f"lead of that size {removed}No effect is named for it, because no law answers an input that is yet to come. "
+        )
+        says += (
+            "The clocks of two columns disagree, one sensor has a slower filter, or the input is held between samples in "
+        )
+        says += "another way. "
+    else:
+        says = f"A delay of up to one sample ({period_s:.3g} s) at {place} {removed}"
+        says += "No effect is named for it: these recordings cannot separate a delay or lag of this size "
+        says += "from the way in which the input is held between samples, recorded or simulated. "
+    if past:
+        says += f"The diagnosis continues with this {'lead' if lead_s > 0.0 else 'delay'}."
+    elif lead_s > 0.0:
+        says += "Shift the column that is early by that time."
+    else:
+        says += "Record at a higher rate, or shift that column by one sample."
+    id = "clock" if lead_s > period_s else "within_sample"
+    return [Finding(id, problem.columns.get(port.channels[0], port.channels[0]), says)]
+
+
+def lead_instead(problem: Problem, found: Found, standing: Sequence[Standing]) -> list[Finding]:
+    """Say where a lead explains the recordings as well as an effect that is named."""
+    tried = {trial.candidate.key: trial for step in found.steps for trial in step.trials if leads(trial)}
+    findings = []
+    for one in standing:
+        for trial in (tried[rival.key] for rival in one.alike if rival.key in tried):
+            column = problem.columns.get(trial.candidate.port.channels[0], trial.candidate.port.channels[0])
+            says = f"The recordings do not separate {one.candidate.name} from column {column} being early by "
+            says += f"{lead_of(trial):.3g} s, as it is where clocks disagree or one sensor has a slower filter."
+            findings.append(Finding("lead", column, says))
+    return findings

@@ -80,7 +80,7 @@ def vanished(fit: Fit, term: Term, rules: SelectionRules) -> bool:
     if not linear and not term.candidate.effect.remembers:
         return False
     own = [(p, float(value)) for p, value in zip(term.parameters, fit.values_of(term), strict=True) if p.linear == linear]
-    amounts = [(p, value) for p, value in own if p.low == 0.0]
+    amounts = [(p, value) for p, value in own if p.low == 0.0 or p.dead_time]
     alone = len(amounts) == len(own) or not linear
     return bool(amounts) and alone and all(abs(v) < rules.least_amount * min(map(abs, p.grid)) for p, v in amounts)
 
@@ -173,7 +173,7 @@ def _zeros(fit: Fit) -> int:
 
 def of_sampling(trial: Trial) -> bool:
     """Whether a delay or lag of an axis' input, all of a drifting one, may be how the input was held between samples or
-    recorded, which is not physics: it is within a sample, and no time between those that this could take.
+    recorded, which is not physics: it is within a sample, and no time between those that this could take. So is each lead.
 
     An input that is held where it should run straight is half a sample late, one that is recorded after its sample a whole
     one, and an integrator of a few steps in a sample a small part of one, or as early as that. A sensor that is read more
@@ -181,13 +181,13 @@ def of_sampling(trial: Trial) -> bool:
     standard deviation d / sqrt(2 L), since L is a parabola in d.
     """
     shift, rules = trial.candidate.effect.shifts, trial.rules
+    if leads(trial):
+        return True
     if not shift or not trial.candidate.port.held:
         return False
     longest_s = max(r.shape[1] for r in trial.fit.residuals) * trial.period_s
     term = trial.fit.terms[-1]
     own = zip(term.parameters, trial.fit.values_of(term), strict=True)
-    if leads(trial):
-        return True
     late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
     late = late_s / trial.period_s
     if late > rules.sampling_delay or trial.seldom:
@@ -199,8 +199,14 @@ def of_sampling(trial: Trial) -> bool:
 
 def leads(trial: Trial) -> bool:
     """Whether the effect of a trial is a delay below zero."""
+    return lead_of(trial) > 0.0
+
+
+def lead_of(trial: Trial) -> float:
+    """Time (s) by which a trial says that the recordings are ahead of the nominal model; 0 where it is not a delay."""
     term = trial.fit.terms[-1]
-    return any(p.unit == "s" and value < 0.0 for p, value in zip(term.parameters, trial.fit.values_of(term), strict=True))
+    own = zip(term.parameters, trial.fit.values_of(term), strict=True)
+    return max((-float(value) for p, value in own if p.dead_time), default=0.0)
 
 
 def within_sample(trials: list[Trial], base: Fit) -> Trial | None:
