@@ -33,7 +33,7 @@ from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.models.simulated import driven_along
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
-from host.diagnosis.selection.between_recordings import inadequate, unlike_recordings
+from host.diagnosis.selection.between_recordings import inadequate, root_mean_square, unlike_recordings
 from host.diagnosis.selection.corners import over_alike
 from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
 from host.diagnosis.selection.drifting import drifting
@@ -63,7 +63,7 @@ from host.diagnosis.selection.remarks import (
 )
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample, lead_instead
 from host.diagnosis.selection.search import concluded, forward, search
-from host.diagnosis.selection.trial import Trial, within_sample
+from host.diagnosis.selection.trial import Trial, lead_of, within_sample
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs, structured_outputs
 from host.diagnosis.selection.within_recordings import changed_within
 from protocol.errors import InputError
@@ -466,7 +466,7 @@ def _past_sampling(again: _Again, begun: _Searched) -> _Searched:
     Such a delay is not named, because it may be a matter of the recording. It still hides what else is missing.
     """
     late = within_sample(begun.found.last_trials, begun.found.best)
-    if late is None:
+    if late is None or (lead_of(late) > 0.0 and _is_remainder(begun, late)):
         return _with_delay_first(again, begun)
     if not begun.problem.budget.spent():
         past = _past_delay(again, late, begun)
@@ -475,6 +475,22 @@ def _past_sampling(again: _Again, begun: _Searched) -> _Searched:
     if begun.found.best.terms:
         return begun
     return replace(begun, findings=[*begun.findings, *late_by_a_sample(begun.problem, late)])
+
+
+def _is_remainder(begun: _Searched, lead: Trial) -> bool:
+    """Whether a lead beyond named effects removes no more than what their inexact formulas may leave.
+
+    A force of friction that is not exactly of its formula is ahead of the place, too. A lead that is more removes half of
+    the squared error, as a clock has to, or a partial share of the mismatch.
+    """
+    problem, largest = begun.problem, 0.0
+    if not begun.found.best.terms or lead.both.share > 1.0 - problem.rules.data.clock_residual_ratio:
+        return False
+    rms = [root_mean_square(problem, fit.residuals) for fit in (begun.found.nominal, begun.found.best, lead.fit)]
+    for sigma, nominal, before, after in zip(problem.noise_sd, *rms, strict=True):
+        if nominal > sigma:
+            largest = max(largest, (before**2 - after**2) / (nominal**2 - sigma**2))
+    return bool(largest < problem.rules.partial_share)
 
 
 def _with_delay_first(again: _Again, begun: _Searched) -> _Searched:
