@@ -87,8 +87,11 @@ def _on_grid(time_s: Array, values: Array, dt_s: float) -> Array:
 
 
 def apply_line(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Adds a sine over time, of the recording's own amplitudes of cosine and sine."""
-    phase = 2.0 * np.pi * p[0] * (c.time_s - c.time_s[0])
+    """Adds a sine over time, of the recording's own amplitudes of cosine and sine at its middle.
+
+    There they do not depend on the frequency, to first order. Fits of both in turns end at once.
+    """
+    phase = 2.0 * np.pi * p[0] * (c.time_s - 0.5 * (c.time_s[0] + c.time_s[-1]))
     return np.asarray(signal + c.starts[0] * np.cos(phase) + c.starts[1] * np.sin(phase))
 
 
