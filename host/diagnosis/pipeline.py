@@ -33,13 +33,14 @@ from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.models.simulated import driven_along
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
-from host.diagnosis.selection.between_recordings import inadequate, root_mean_square, unlike_recordings
+from host.diagnosis.selection.between_recordings import inadequate, unlike_recordings
 from host.diagnosis.selection.corners import over_alike
 from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
 from host.diagnosis.selection.drifting import drifting
 from host.diagnosis.selection.early import early_outputs
 from host.diagnosis.selection.equivalence import (
     Standing,
+    mismatch_removed,
     most_probable,
     standings,
     with_unlisted_rival,
@@ -331,9 +332,8 @@ def _diagnosed(
         result.findings += lines_in_spectrum(full, fits)
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best)
-        late = any(
-            finding.id in ("within_sample", "clock") for finding in done.findings
-        )  # it explains what exceeds the noise
+        # a delay or lead that is not named explains what exceeds the noise
+        late = any(finding.id in ("within_sample", "clock") for finding in done.findings)
         result.findings += slow_noise(full, fits, slow) or ([] if late else larger_than_noise(full, fits, figures))
     known = between or any(finding.id in ("jump", "line") for finding in result.findings)
     if result.verdict == "mismatch_not_identified" and not found.best.terms and not known:
@@ -483,14 +483,10 @@ def _is_remainder(begun: _Searched, lead: Trial) -> bool:
     A force of friction that is not exactly of its formula is ahead of the place, too. A lead that is more removes half of
     the squared error, as a clock has to, or a partial share of the mismatch.
     """
-    problem, largest = begun.problem, 0.0
-    if not begun.found.best.terms or lead.both.share > 1.0 - problem.rules.data.clock_residual_ratio:
+    found, rules = begun.found, begun.problem.rules
+    if not found.best.terms or lead.both.share > 1.0 - rules.data.clock_residual_ratio:
         return False
-    rms = [root_mean_square(problem, fit.residuals) for fit in (begun.found.nominal, begun.found.best, lead.fit)]
-    for sigma, nominal, before, after in zip(problem.noise_sd, *rms, strict=True):
-        if nominal > sigma:
-            largest = max(largest, (before**2 - after**2) / (nominal**2 - sigma**2))
-    return bool(largest < problem.rules.partial_share)
+    return mismatch_removed(begun.problem, found.nominal, found.best, lead.fit) < rules.partial_share
 
 
 def _with_delay_first(again: _Again, begun: _Searched) -> _Searched:

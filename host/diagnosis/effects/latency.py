@@ -12,7 +12,7 @@ EARLIEST = 8.0  # samples by which a channel may come first; what comes earlier 
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Delay: no longer than leaves most of the recording to compare, and shorter than zero by two samples at most.
+    """Delay: no longer than leaves most of the recording to compare, and a lead of `EARLIEST` samples at most.
 
     No law answers an input that is yet to come, so a lead is never named. It is a matter of the recording: of clocks, of
     filters of the sensors, of an integrator that moves the place with the speed of the end of each step.

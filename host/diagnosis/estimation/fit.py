@@ -157,7 +157,7 @@ class Problem:
 
     def late_s(self, terms: tuple[Term, ...], values: Array) -> float:
         """Dead time of all terms together (s)."""
-        return sum(max(float(value), 0.0) for p, value in zip(self.parameters(terms), values, strict=True) if p.dead_time)
+        return sum(max(dead_s, 0.0) for dead_s in self._dead_times_s(terms, values))
 
     def unseen(self, segment: Segment, terms: tuple[Term, ...], values: Array, dead_s: float | None = None) -> int:
         """First samples (number) that a dead time makes of what was before the recording: nothing can predict them.
@@ -175,7 +175,10 @@ class Problem:
 
     def lead_s(self, terms: tuple[Term, ...], values: Array) -> float:
         """Lead of all terms together (s): dead times below zero."""
-        return sum(max(-float(value), 0.0) for p, value in zip(self.parameters(terms), values, strict=True) if p.dead_time)
+        return sum(max(-dead_s, 0.0) for dead_s in self._dead_times_s(terms, values))
+
+    def _dead_times_s(self, terms: tuple[Term, ...], values: Array) -> list[float]:
+        return [float(value) for p, value in zip(self.parameters(terms), values, strict=True) if p.dead_time]
 
     def ends(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> int:
         """Last samples (number) that a lead, or a clock which runs faster, makes of what came after the recording."""

@@ -33,7 +33,7 @@ class Parameter:
     step: float = 0.0  # natural size of a signed parameter; 0: the largest of the grid
     vanishes: bool = False  # its lower bound is as good as zero: no sign that another form is wanted
     shape: bool = False  # its upper bound is a limit of the form, even where the effect's bounds are natural
-    dead_time: bool = False  # the output's first so many seconds come from what was before the recording
+    dead_time: bool = False  # so many seconds of the output come from before the recording, below zero from after it
     event: bool = False  # the instant of a single event: only samples around it show it, no finer than their period
     follows: str = ""  # nominal parameter whose sign it has: a branch of a spring counts as the spring does
     spectral: bool = False  # a frequency in Hz: tried where the residual's spectrum has its lines
@@ -65,7 +65,6 @@ class Scale:
     source_span: float = 1.0
     motion_unit: str = ""  # force ports: unit of the motion
     motion_span: float = 1.0
-    held: bool = False  # the signal is an input that is held between samples
 
 
 @dataclass

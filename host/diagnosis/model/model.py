@@ -311,7 +311,6 @@ def scale_of(model: Model, segments: list[Segment], port: Port, candidate: Candi
         source_span=float(np.ptp(source)) or 1.0,
         motion_unit=used[0].units.get(f"motion:{port.name}", unit),
         motion_span=span,
-        held=port.held,
     )
 
 

@@ -5,7 +5,7 @@ A pair is an input and an output that the nominal model says to move together. N
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -104,8 +104,13 @@ def lead_by_gain(recording: Recording, path: Pair, rules: DataRules) -> float:
     window = smoothing_window(x, dt, white_level(x), 7 * dt)
     smooth_x, smooth_y = (smooth_derivatives(signal, dt, window)[0] for signal in (x, y))
     line, at = CubicSpline(np.arange(x.size), smooth_x), np.arange(x.size - best - 1)
-    near = (best - 1, best + 1)
-    return float(minimize_scalar(lambda lead: _left(line(at + lead), smooth_y[at]), bounds=near, method="bounded").x)
+    return _between_samples(lambda lead: _left(line(at + lead), smooth_y[at]), best)[0]
+
+
+def _between_samples(left: Callable[[float], float], whole: int) -> tuple[float, float]:
+    """The shift (samples) within one of `whole`, and from 0 on, with the least residual, and that residual."""
+    best = minimize_scalar(left, bounds=(max(whole - 1, 0), whole + 1), method="bounded")
+    return float(best.x), float(best.fun)
 
 
 def _left(x: Array, y: Array) -> float:
@@ -359,17 +364,16 @@ def lead_by_law(recording: Recording, path: Pair, leading: str, rules: DataRules
 
     smooth, passed = smooth_derivatives(force, dt, window)[0], float(np.linalg.norm(savgol_coeffs(window, 3)))
     ratio, over = rules.clock_residual_ratio, rules.clock_over_noise
-    levels = [(force, over * noise), (smooth, over * passed * noise)]
-    if all(clean > ratio * shifted(signal, 0) for signal, clean in levels):
+    levels = [(force, shifted(force, 0), over * noise), (smooth, shifted(smooth, 0), over * passed * noise)]
+    if all(clean > ratio * now for _, now, clean in levels):
         return 0.0
     side = -1 if leading == path.input else 1  # a force that comes first is found before its motion
     # A damping takes over a part of a shift. Only a force that is smoothed as its motion is finds the whole of it.
     whole = int(np.argmin([shifted(smooth, side * lead) for lead in range(most)]))
     line, at = CubicSpline(np.arange(force.size), smooth), np.arange(edge, force.size - edge)
-    near = (max(whole - 1, 0), min(whole + 1, most))
-    best = minimize_scalar(lambda lead: left(line(at + side * lead)), bounds=near, method="bounded")
-    for (signal, clean), after in zip(levels, (shifted(force, side * whole), best.fun), strict=True):
+    best, least = _between_samples(lambda lead: left(line(at + side * lead)), whole)
+    for (signal, now, clean), after in zip(levels, (shifted(force, side * whole), least), strict=True):
         others = min(shifted(signal, -side * lag) for lag in range(0, most, 2))
-        if after < min(clean, ratio * shifted(signal, 0), ratio * others):
-            return float(best.x)
+        if after < min(clean, ratio * now, ratio * others):
+            return best
     return 0.0

@@ -282,7 +282,7 @@ def _put_later(problem: Problem, recording: Recording, channel: str, samples: fl
         if name == channel:
             padded = np.concatenate((np.full(max(whole, 0), np.nan), values))
             moved[name] = padded[kept.start - min(whole, 0) :][: kept.stop - kept.start]
-        elif rest > 0.0 and np.isfinite(values).any():
+        elif rest > 0.0:
             moved[name] = later(values, rest, smooth)[kept]
         else:
             moved[name] = values[kept]

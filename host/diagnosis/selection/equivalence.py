@@ -64,7 +64,7 @@ def standings(problem: Problem, found: Found) -> list[Standing]:
         alone = _rests_on(problem, less, found.best, term.fitted)
         # No inexact formula of another effect leaves a line that no motion has.
         doubtful = less.terms and not term.candidate.effect.memories
-        share = _share(problem, found, less) if doubtful else np.inf
+        share = mismatch_removed(problem, found.nominal, less, found.best) if doubtful else np.inf
         out.append(Standing(term.candidate, gain, both, alike, differences, term.fitted, share, alone, crossed is not None))
     return out
 
@@ -184,18 +184,17 @@ def _with_rival(problem: Problem, best: Fit, candidate: Candidate, trial: Trial)
     return refined(problem, finish(problem, minimize(problem, (*terms, term), begin, rounds=10, tolerance=1e-4)))
 
 
-def _share(problem: Problem, found: Found, less: Fit) -> float:
-    """Part of the nominal mismatch above noise that an effect removes from the model `less` without it, in the output where
-    that is most.
+def mismatch_removed(problem: Problem, nominal: Fit, less: Fit, more: Fit) -> float:
+    """Part of the mismatch of `nominal` above noise that `more` removes from what `less` leaves, in the output where that is
+    most.
     """
     largest = 0.0
     for row, sigma in enumerate(problem.noise_sd):
-        nominal, without_it, best = (
-            float(np.nanmean(np.concatenate([r[row] for r in fit.residuals]) ** 2))
-            for fit in (found.nominal, less, found.best)
+        whole, before, after = (
+            float(np.nanmean(np.concatenate([r[row] for r in fit.residuals]) ** 2)) for fit in (nominal, less, more)
         )
-        if nominal > sigma**2:
-            largest = max(largest, (without_it - best) / (nominal - sigma**2))
+        if whole > sigma**2:
+            largest = max(largest, (before - after) / (whole - sigma**2))
     return largest
 
 

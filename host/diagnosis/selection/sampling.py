@@ -82,16 +82,10 @@ def late_by_a_sample(problem: Problem, late: Trial, past: bool = False) -> list[
     place, removed = port.name.replace("_", " "), f"removes {late.both.share:.0%} of the squared error. "
     lead_s = lead_of(late)
     if lead_s > 0.0:
-        says = (
-            f"The recordings are {lead_s:.3g} s ({lead_s / period_s:.2g} samples) ahead of the nominal model at {place}: a "
-        )
-        says += (
-            f"lead of that size {removed}No effect is named for it, because no law answers an input that is yet to come. "
-        )
-        says += (
-            "The clocks of two columns disagree, one sensor has a slower filter, or the input is held between samples in "
-        )
-        says += "another way. "
+        says = f"The recordings are {lead_s:.3g} s ({lead_s / period_s:.2g} samples) ahead of the nominal model at {place}: "
+        says += f"a lead of that size {removed}No effect is named for it, because no law answers an input that is yet to "
+        says += "come. The clocks of two columns disagree, one sensor has a slower filter, or the input is held between "
+        says += "samples in another way. "
     else:
         says = f"A delay of up to one sample ({period_s:.3g} s) at {place} {removed}"
         says += "No effect is named for it: these recordings cannot separate a delay or lag of this size "
@@ -103,7 +97,12 @@ def late_by_a_sample(problem: Problem, late: Trial, past: bool = False) -> list[
     else:
         says += "Record at a higher rate, or shift that column by one sample."
     id = "clock" if lead_s > period_s else "within_sample"
-    return [Finding(id, problem.columns.get(port.channels[0], port.channels[0]), says)]
+    return [Finding(id, _column(problem, late), says)]
+
+
+def _column(problem: Problem, late: Trial) -> str:
+    name = late.candidate.port.channels[0]
+    return problem.columns.get(name, name)
 
 
 def lead_instead(problem: Problem, found: Found, standing: Sequence[Standing]) -> list[Finding]:
@@ -112,7 +111,7 @@ def lead_instead(problem: Problem, found: Found, standing: Sequence[Standing]) -
     findings = []
     for one in standing:
         for trial in (tried[rival.key] for rival in one.alike if rival.key in tried):
-            column = problem.columns.get(trial.candidate.port.channels[0], trial.candidate.port.channels[0])
+            column = _column(problem, trial)
             says = f"The recordings do not separate {one.candidate.name} from column {column} being early by "
             says += f"{lead_of(trial):.3g} s, as it is where clocks disagree or one sensor has a slower filter."
             findings.append(Finding("lead", column, says))
