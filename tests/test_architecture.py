@@ -48,6 +48,8 @@ DIAGNOSIS = [  # bottom up: each may import those above it in this list
     "host.diagnosis.selection",
     "host.diagnosis.design",
     "host.diagnosis.live",
+    "host.diagnosis.problems",
+    "host.diagnosis.second_search",
     "host.diagnosis.pipeline",
     "host.diagnosis.report",
     "host.diagnosis.export",

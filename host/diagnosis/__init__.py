@@ -141,8 +141,8 @@ def diagnose(
     from host.diagnosis.model.dataset import find_files
     from host.diagnosis.model.nominal import effect_of, nominal_of, nominal_path, read_nominal
     from host.diagnosis.model.tables import table_of
-    from host.diagnosis.pipeline import NothingToCompare
     from host.diagnosis.pipeline import diagnose as run
+    from host.diagnosis.problems import NothingToCompare
     from host.diagnosis.report.verdict import as_json, without_fit
 
     began = time.monotonic()

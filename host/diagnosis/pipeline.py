@@ -13,25 +13,25 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from host.diagnosis.design.experiment import Design, design
-from host.diagnosis.effects import candidates
-from host.diagnosis.estimation import noise as noise_module
 from host.diagnosis.estimation.fit import Fit, Problem
-from host.diagnosis.estimation.known import Known
-from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.estimation.uncertainty import idle_inputs, intervals, uncertain
-from host.diagnosis.live.recorded_rig import RecordedRig
-from host.diagnosis.model import readings
-from host.diagnosis.model.dataset import Recording, load, read_tables, thin
-from host.diagnosis.model.effect import Candidate, Port
-from host.diagnosis.model.findings import Finding, Inspected, inspect
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.findings import Finding, Inspected
 from host.diagnosis.model.model import Model
-from host.diagnosis.model.nominal import EffectSpec, NominalSpec
+from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.pairs import driven_of
 from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.tables import Table
-from host.diagnosis.models import build, channels_of
 from host.diagnosis.models.simulated import driven_along
+from host.diagnosis.problems import (
+    candidates_of,
+    inspected,
+    problem_of,
+    problems,
+    thinning,
+)
+from host.diagnosis.second_search import Again, Searched, past_held_values, past_sampling
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
 from host.diagnosis.selection.between_recordings import inadequate, unlike_recordings
 from host.diagnosis.selection.corners import over_alike
@@ -40,7 +40,6 @@ from host.diagnosis.selection.drifting import drifting
 from host.diagnosis.selection.early import early_outputs
 from host.diagnosis.selection.equivalence import (
     Standing,
-    mismatch_removed,
     most_probable,
     standings,
     with_unlisted_rival,
@@ -62,12 +61,11 @@ from host.diagnosis.selection.remarks import (
     slow_noise,
     times_noise,
 )
-from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample, lead_instead
-from host.diagnosis.selection.search import concluded, forward, search
-from host.diagnosis.selection.trial import Trial, lead_of, within_sample
+from host.diagnosis.selection.sampling import hold_between_samples, lead_instead
+from host.diagnosis.selection.search import concluded, forward
+from host.diagnosis.selection.trial import within_sample
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs, structured_outputs
 from host.diagnosis.selection.within_recordings import changed_within
-from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -94,96 +92,6 @@ class Diagnosis:
     designs: list[Design] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     stopped_early: bool = False
-
-
-class NothingToCompare(Exception):
-    """No recording has what the nominal model compares; `findings` say why."""
-
-    def __init__(self, findings: list[Finding]) -> None:
-        super().__init__(" ".join(finding.says for finding in findings))
-        self.findings = findings
-
-
-def inspected(spec: NominalSpec, sources: Sequence[Path | Table], rules: SelectionRules = RULES) -> Inspected:
-    """Recordings as they can be compared, and what is wrong with them. Raises InputError, NothingToCompare."""
-    if spec.recorded_rig and not all(isinstance(source, Path) for source in sources):
-        raise InputError("recordings", "arrays", "files (MCAP): a recorded rig is described in its own recordings")
-    tables = read_tables(spec, sources)
-    spec._files = [table.path for table in tables if table.path is not None]
-    needed, optional = channels_of(spec)
-    data = inspect(spec, load(spec, tables, needed, optional, rules.data), rules.data)
-    if not data.recordings:
-        raise NothingToCompare(data.findings)
-    return data
-
-
-def prepare(
-    spec: NominalSpec, sources: Sequence[Path | Table], rules: SelectionRules = RULES
-) -> tuple[Model, Problem, Problem]:
-    """Model, the problem at the rate that is fitted, and the problem at full rate. Raises InputError, NothingToCompare."""
-    return problems(spec, inspected(spec, sources, rules).recordings, rules)
-
-
-def problems(
-    spec: NominalSpec, recordings: list[Recording], rules: SelectionRules = RULES
-) -> tuple[Model, Problem, Problem]:
-    """Model, the problem at the rate that is fitted, and the problem at full rate."""
-    model: Model = RecordedRig(spec) if spec.recorded_rig else build(spec)
-    if spec.effect:
-        model = Known(model, spec.effect, recordings)
-    factor = thinning(model, recordings)
-    columns = {name: channel.column for name, channel in channels_of(spec)[0].items()}
-    full = _problem(model, recordings, columns, rules)
-    return model, full if factor <= 1 else _problem(model, recordings, columns, rules, factor), full
-
-
-def thinning(model: Model, recordings: list[Recording]) -> int:
-    """Samples averaged into one, so that a fit stays in seconds; never coarser than the model allows."""
-    total = sum(r.n for r in recordings)
-    factor = max(1, round(total / model.fit_samples))
-    if recordings[0].timed:
-        factor = min(factor, max(1, int(model.coarsest_s / recordings[0].dt_s + 1e-9)))
-    return factor
-
-
-def _problem(
-    model: Model, recordings: list[Recording], columns: dict[str, str], rules: SelectionRules, factor: int = 1
-) -> Problem:
-    """The problem of recordings of which `factor` samples are averaged into one."""
-    segments = [model.prepare(thin(r, factor)) for r in recordings]
-    still = [
-        noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed, rules)
-        for p in segments
-    ]
-    repeats = noise_module.repeated([[p.inputs[name] for name in model.quiet_inputs] for p in segments], rules)
-    noises: list[Noise] = []
-    for row in range(len(model.outputs)):
-        # single wild samples would raise the noise by which they are found
-        tame = [
-            np.where(readings.wild(p.y[row], readings.scatter(p.y[row]), rules.data), np.nan, p.y[row]) for p in segments
-        ]
-        found = noise_module.estimate(tame, still, repeats, model.simulates, rules)
-        seldom = [readings.repeated(p.y[row], rules.data) for p in segments]
-        for segment, places in zip(segments, seldom, strict=True):
-            if places is not None:
-                segment.repeats[row] = places
-        if any(places is not None for places in seldom):  # the noise of readings, not of their repetitions
-            kept = [slice(None) if places is None else np.unique(places) for places in seldom]
-            read = [y[k] for y, k in zip(tame, kept, strict=True)]
-            alone = noise_module.estimate(read, [m[k] for m, k in zip(still, kept, strict=True)], rules=rules)
-            found = replace(found, sigma=max(found.sigma, alone.sigma))
-        own = [noise for noise in (model.noise_of(p) for p in segments) if noise is not None]
-        if own:
-            found = sorted(own, key=lambda noise: noise.sigma)[len(own) // 2]
-        noises.append(found)
-        for segment in segments:
-            segment.y[row, readings.wild(segment.y[row], found.sigma, rules.data)] = np.nan
-    for segment in segments:
-        segment.resolution = np.array([readings.resolution(y, rules.data, switched=False) for y in segment.y]) / np.sqrt(
-            12.0
-        )
-    period_s = recordings[0].dt_s if recordings[0].timed else 0.0
-    return Problem(model, segments, noises, np.ones(len(model.outputs)), columns, rules, recorded_s=period_s)
 
 
 def diagnose(
@@ -312,6 +220,7 @@ def _diagnosed(
         *lead_instead(problem, found, standing),
         *idle_inputs(problem, found.best),
         *uncertain(problem, found.best, spans),
+        *done.contradicted(spans),
         *model.findings(),
     ]
     result.findings.sort(key=lambda finding: finding.id != "frozen")  # it is to be corrected before anything else
@@ -353,7 +262,7 @@ def _parameters_differ(full: Problem, problem: Problem, found: Found) -> list[Fi
     factor = thinning(problem.model, whole) if full is not problem else 1
 
     def prepared(recordings: list[Recording]) -> Problem:
-        return _problem(problem.model, recordings, problem.columns, problem.rules, factor)
+        return problem_of(problem.model, recordings, problem.columns, problem.rules, factor)
 
     return unlike_recordings(problem, nominal, rival) or changed_within(problem, nominal, rival, whole, prepared)
 
@@ -377,17 +286,9 @@ def clocks_put_right(spec: NominalSpec, data: Inspected, left_out: frozenset[str
         return data
     model, problem, _ = problems(spec if axis is None else _by_motion(spec), data.recordings, rules)
     model.try_out(problem.segments)
-    effects = _candidates(problem, left_out)
+    effects = candidates_of(problem, left_out)
     recordings, findings = early_outputs(problem, data.recordings, effects)
     return Inspected(recordings, [*data.findings, *findings])
-
-
-def _candidates(problem: Problem, left_out: frozenset[str]) -> list[Candidate]:
-    """Candidate effects of a problem, whose initial states are fitted together with the parameters on a linear path."""
-    ports = candidate_ports(problem)
-    problem.joint_states = any(port.path for port in ports)
-    found = candidates(ports, problem.segments[0].recording.timed, problem.model.taken | left_out)
-    return [candidate for candidate in found if candidate.effect.id not in left_out]
 
 
 def _third(budget: Budget) -> Budget:
@@ -403,7 +304,7 @@ def _searched(
     overall: Overall,
     share: tuple[float, float],
     to_noise: bool = False,
-) -> _Searched | None:
+) -> Searched | None:
     """Search in all recordings, between two shares of the whole work; `left_out`: effect ids that are not considered.
 
     to_noise: None unless single effects explain the outputs down to white noise.
@@ -422,7 +323,7 @@ def _searched(
     if lone:
         model, problem, full = problems(spec, recordings, rules)
     problem.budget = budget
-    candidate_effects = _candidates(problem, left_out)
+    candidate_effects = candidates_of(problem, left_out)
     held = hold_between_samples(problem, [full] if full is not problem else [], candidate_effects)
     cost = model.announce(problem.segments, model.guess(problem.segments))
     if cost:
@@ -435,111 +336,10 @@ def _searched(
     if to_noise and not at_white_noise(problem, found.best if late is None else late.fit):
         return None
     found = concluded(problem, found, candidate_effects, progress)
-    begun = _Searched(model, problem, full, found, [*apart, *frozen, *lone, *held])
-    return _past_sampling(_Again(spec, recordings, candidate_effects, overall.part(later, high)), begun)
-
-
-@dataclass(frozen=True)
-class _Searched:
-    """What was searched, and what was found in it."""
-
-    model: Model
-    problem: Problem
-    full: Problem
-    found: Found
-    findings: list[Finding]  # what was found about the data on the way
-
-
-@dataclass(frozen=True)
-class _Again:
-    """What a second search starts from: the nominal model and recordings of the first one, its effects, its progress."""
-
-    spec: NominalSpec
-    recordings: list[Recording]
-    candidates: list[Candidate]
-    progress: Progress
-
-
-def _past_sampling(again: _Again, begun: _Searched) -> _Searched:
-    """What a second search finds, with a delay within one sample among the nominal parameters, where the data call for one.
-
-    Such a delay is not named, because it may be a matter of the recording. It still hides what else is missing.
-    """
-    late = within_sample(begun.found.last_trials, begun.found.best)
-    if late is None or (lead_of(late) > 0.0 and _is_remainder(begun, late)):
-        return _with_delay_first(again, begun)
-    if not begun.problem.budget.spent():
-        past = _past_delay(again, late, begun)
-        if past is not None:
-            return past
-    if begun.found.best.terms:
-        return begun
-    return replace(begun, findings=[*begun.findings, *late_by_a_sample(begun.problem, late)])
-
-
-def _is_remainder(begun: _Searched, lead: Trial) -> bool:
-    """Whether a lead beyond named effects removes no more than what their inexact formulas may leave.
-
-    A force of friction that is not exactly of its formula is ahead of the place, too. A lead that is more removes half of
-    the squared error, as a clock has to, or a partial share of the mismatch.
-    """
-    found, rules = begun.found, begun.problem.rules
-    if not found.best.terms or lead.both.share > 1.0 - rules.data.clock_residual_ratio:
-        return False
-    return mismatch_removed(begun.problem, found.nominal, found.best, lead.fit) < rules.partial_share
-
-
-def _with_delay_first(again: _Again, begun: _Searched) -> _Searched:
-    """What a search finds past a delay within one sample that alone did nearly as well as the first effect, if likelier.
-
-    An effect can stand in for such a delay together with what else is missing. Once it is named, nothing calls for the
-    delay any more.
-    """
-    found, rules = begun.found, begun.problem.rules
-    first = found.steps[0] if found.best.terms and found.steps else None
-    late = within_sample(first.trials, found.nominal) if first is not None else None
-    if first is None or late is None or begun.problem.budget.spent():
-        return begun
-    if late.score < rules.alternative_start_score * first.trials[0].score:
-        return begun
-    past = _past_delay(again, late, begun)
-    if past is None:
-        return begun
-    ahead = begun.problem.gain("both", found.best.residuals, past.found.best.residuals).log_likelihood
-    more = past.found.best.fitted + late.fit.fitted - found.best.fitted  # the delay is a parameter, too
-    return past if ahead > rules.heldout_log_likelihood + rules.parameter_penalty * more else begun
-
-
-def _past_delay(again: _Again, late: Trial, begun: _Searched) -> _Searched | None:
-    """The search with the delay of `late` among the nominal parameters; None if that names nothing better.
-
-    What is named may be no shape of the delay: its gain has to be that of a further effect, it is not a linear effect at the
-    place of the delay, and the delay stays within the sample.
-    """
-    candidate, term, problem = late.candidate, late.fit.terms[-1], begun.problem
-    values = {p.key: float(value) for p, value in zip(term.parameters, late.fit.values_of(term), strict=True)}
-    known = EffectSpec(
-        id=candidate.effect.id, at=candidate.port.name, values=values, source=candidate.source, form=candidate.form
-    )
-    extended = again.spec.model_copy(update={"effect": [*again.spec.effect, known]})
-    model, second, full = problems(extended, again.recordings, problem.rules)
-    second.budget, second.joint_states = problem.budget, problem.joint_states
-    for each in (second, full) if model.holds else ():
-        model.hold_as(each.segments, problem.model.hold)
-    place = {*candidate.port.path, candidate.port.name}
-    others = [c for c in again.candidates if not (c.effect.shifts and (c.port.held or c.port.name in place))]
-    found = search(second, others, again.progress, late.both.log_likelihood)
-    own = [t for t in found.best.terms if not (t.candidate.effect.invariant and t.candidate.port.name in place)]
-    delay_s = found.best.values[len(problem.model.parameters) : len(model.parameters)]
-    late_s = float(np.max(delay_s, initial=0.0))
-    if not own or late_s > problem.rules.sampling_delay * problem.segments[0].recording.dt_s:
-        return None
-    before, rules = late.fit.residuals, problem.rules
-    ahead = problem.gain("both", before, found.best.residuals).log_likelihood
-    earned = problem.gain("both", begun.found.nominal.residuals, before).log_likelihood
-    if ahead < -max(rules.heldout_log_likelihood, rules.refinement_tolerance * earned):
-        return None
-    return _Searched(model, second, full, found, [*begun.findings, *late_by_a_sample(second, late, past=True)])
+    begun = Searched(model, problem, full, found, [*apart, *frozen, *lone, *held])
+    again = Again(spec, recordings, candidate_effects, overall.part(later, high))
+    again, begun = past_held_values(again, begun)
+    return past_sampling(again, begun)
 
 
 def _without_frozen(
@@ -566,10 +366,3 @@ def _without_lone_samples(
         return recordings, []
     nominal = fit_nominal(problem)
     return outliers_of_residual(full, at_full_rate(full, nominal, problem), recordings)
-
-
-def candidate_ports(problem: Problem) -> tuple[Port, ...]:
-    """Ports of the model, each with those at which a linear time-invariant effect does the same."""
-    first = next(segment for segment in problem.segments if segment.fit.any())
-    path = problem.model.linear_path(first, problem.model.guess(problem.segments))
-    return tuple(replace(port, path=path) if port.name in path else port for port in problem.model.ports)

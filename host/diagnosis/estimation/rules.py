@@ -132,6 +132,7 @@ class SelectionRules:
     most_steps: int = 10
     alternative_starts: int = 2  # second-best first effects from which selection is repeated
     alternative_start_score: float = 0.6  # least part of the best one's score
+    held_values_tried: int = 2  # that are fitted for each place among those to fit
     first_pairs: int = 8  # pairs of the first step's effects on a loaded link from which the best is taken to begin again
     exchange_rounds: int = 2
     exchange_fits: int = 4  # rivals fitted in each place

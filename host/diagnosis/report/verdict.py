@@ -36,6 +36,7 @@ REMARKS = (
     "outliers",
     "quantized",
     "hold",
+    "held",
     "repeated",
     "session",
     "changed",
@@ -107,6 +108,10 @@ def next_step(result: Diagnosis) -> str:
     first = next((f for f in result.findings if f.id not in REMARKS and (f.id, f.channel) not in remarks), None)
     if first is not None:
         return f"Correct the data first ({first.id}: {first.channel}), then diagnose again."
+    held = [f.channel for f in result.findings if f.id == "held"]
+    if held:
+        names = " and ".join(dict.fromkeys(held))
+        return f"Correct {names} in the nominal file, or let it be fitted, and find out why it differs."
     if any(term.candidate.effect.dated for term in result.found.best.terms):
         return "Home the axis, find out what happened to it and to its sensor at these instants, and record again."
     unsure = [entry for entry in named if entry["probability"] < result.problem.rules.confident]

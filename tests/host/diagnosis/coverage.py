@@ -12,7 +12,7 @@ from host.diagnosis.estimation.fit import finish, minimize, reweigh
 from host.diagnosis.estimation.known import chosen
 from host.diagnosis.estimation.uncertainty import intervals
 from host.diagnosis.model.nominal import effect_of, read_nominal
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.refits import fit_nominal, refined
 from host.diagnosis.selection.screening import term_of
 from tests.host.diagnosis import planted

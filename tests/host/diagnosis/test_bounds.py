@@ -15,7 +15,7 @@ from host.diagnosis.estimation.rules import RULES, Budget
 from host.diagnosis.model.effect import Array, Candidate, Parameter, Port, Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection import search
 from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.refits import fit_nominal, try_fit

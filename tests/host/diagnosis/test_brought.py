@@ -13,7 +13,7 @@ from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.spectral_line import common_line
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models.linear import StateSpace, closed_loop, sampled
-from host.diagnosis.pipeline import inspected
+from host.diagnosis.problems import inspected
 
 Array = np.ndarray
 RATE_HZ = 100.0

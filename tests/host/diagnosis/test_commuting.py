@@ -14,7 +14,7 @@ from host.diagnosis.estimation.fit import Fit, Term, finish, minimize, size_of
 from host.diagnosis.model.effect import Candidate, Context, Effect, Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import candidate_ports, prepare
+from host.diagnosis.problems import candidate_ports, prepare
 from host.diagnosis.selection.refits import fit_nominal, refined
 from host.diagnosis.selection.screening import replaced_by, term_of
 

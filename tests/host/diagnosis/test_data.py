@@ -14,7 +14,7 @@ from host.diagnosis.model.findings import inspect
 from host.diagnosis.model.nominal import NominalSpec, nominal_of, read_nominal
 from host.diagnosis.model.tables import Table, read_table, table_of
 from host.diagnosis.models import build, channels_of
-from host.diagnosis.pipeline import inspected
+from host.diagnosis.problems import inspected
 from protocol.errors import InputError
 
 TOML = """

@@ -11,7 +11,7 @@ import pytest
 import seldinger as sd
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.nominal import read_nominal
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.symbolic.dictionary import PredictedPart, forms_at, is_curve, predict_residual
 from tests.host.diagnosis import planted, rig_cases

@@ -9,7 +9,7 @@ import pytest
 import seldinger as sd
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.drifting import drifting
 from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.refits import fit_nominal

@@ -12,7 +12,8 @@ import seldinger as sd
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import clocks_put_right, inspected
+from host.diagnosis.pipeline import clocks_put_right
+from host.diagnosis.problems import inspected
 
 Array = np.ndarray
 Columns = dict[str, Array]

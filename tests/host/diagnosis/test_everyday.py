@@ -17,7 +17,7 @@ from host.diagnosis.model.effect import Candidate, Port, Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.operators import lag, quantum, shift
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import inspected
+from host.diagnosis.problems import inspected
 from host.diagnosis.selection.posterior import posterior
 from host.diagnosis.selection.trial import vanished
 from tests.host.proof.everyday import first_order_nominal

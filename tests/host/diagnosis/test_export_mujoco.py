@@ -16,7 +16,7 @@ from host.diagnosis.export.write import export
 from host.diagnosis.model.model import scale_of
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from protocol.errors import InputError
 from tests.host.diagnosis.test_mujoco import ARM, NOMINAL, mujoco, real
 

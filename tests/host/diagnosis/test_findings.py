@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import NothingToCompare, inspected, prepare
+from host.diagnosis.problems import NothingToCompare, inspected, prepare
 from host.diagnosis.selection.refits import fit_nominal
 from tests.host.proof.everyday import spring_nominal
 

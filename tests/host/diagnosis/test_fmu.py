@@ -16,7 +16,7 @@ from host.diagnosis.export.parameters import ssv_of
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.model.trust import code_of, code_path
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from protocol.errors import InputError
 from tests.host.diagnosis.test_export import found
 

@@ -18,7 +18,7 @@ from host.diagnosis.model.operators import play
 from host.diagnosis.model.pairs import driven_of
 from host.diagnosis.model.readings import Finding
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import inspected, problems
+from host.diagnosis.problems import inspected, problems
 from host.diagnosis.selection.frozen_inputs import without_frozen
 from host.diagnosis.selection.full_rate import at_full_rate
 from host.diagnosis.selection.refits import fit_nominal

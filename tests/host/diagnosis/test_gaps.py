@@ -11,7 +11,7 @@ from scipy.signal import lsim
 from host.diagnosis.estimation.initial_state import estimate_state
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 
 DT = 0.01
 T = DT * np.arange(2000)

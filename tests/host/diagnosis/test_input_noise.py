@@ -14,7 +14,7 @@ from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.operators import smooth_derivatives
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models.moved import DEGREE, Moved
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.refits import fit_nominal
 
 Array = npt.NDArray[np.float64]

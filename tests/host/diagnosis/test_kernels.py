@@ -15,7 +15,7 @@ from host.diagnosis.model.force_kernel import along, run_axis, slot_array
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.models.axis import stages
 from host.diagnosis.models.rig_kernel import Handle, Loads, ShaftBuild, Wall, contact, matrices, rotation_logs, shapes
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.refits import fit_nominal
 from tests.host.diagnosis import rig_cases
 

@@ -12,7 +12,7 @@ from host.diagnosis.model.model import Model
 from host.diagnosis.model.nominal import EffectSpec, nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build
-from host.diagnosis.pipeline import inspected, problems
+from host.diagnosis.problems import inspected, problems
 from protocol.errors import InputError
 
 JOINED = {"parameters", "taken"}  # attributes to which the known effects add

@@ -18,7 +18,7 @@ from host.diagnosis.model.expressions import names_in, value_of
 from host.diagnosis.model.model import Begin, Model
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.refits import fit_nominal, refined
 from protocol.errors import InputError
 

@@ -16,7 +16,7 @@ from host.diagnosis.estimation.noise import NoiseSource, estimate
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.refits import fit_nominal, refined
 from host.diagnosis.selection.removal import drop_unsure

@@ -11,7 +11,7 @@ import pytest
 from host.diagnosis.model.effect import Array
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from protocol.errors import InputError
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'seldinger[mujoco]'")

@@ -12,7 +12,7 @@ from host.diagnosis import diagnose
 from host.diagnosis.effects import candidates
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import inspected, prepare
+from host.diagnosis.problems import inspected, prepare
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.selection.search import search

@@ -12,7 +12,7 @@ import seldinger as sd
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.model.nominal import read_nominal
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.equivalence import standings
 from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.refits import fit_nominal

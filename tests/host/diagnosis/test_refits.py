@@ -12,7 +12,7 @@ from host.diagnosis.estimation.uncertainty import intervals
 from host.diagnosis.model.effect import Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.problems import prepare
 from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.selection.removal import unsure
 from host.diagnosis.selection.screening import term_of

@@ -16,7 +16,7 @@ from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import inspected, prepare
+from host.diagnosis.problems import inspected, prepare
 from protocol.errors import InputError
 
 SOURCES = Path(__file__).parents[3] / "host" / "diagnosis"

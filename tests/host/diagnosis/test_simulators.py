@@ -21,7 +21,7 @@ from host.diagnosis.model.effect import Array
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import simulated
-from host.diagnosis.pipeline import candidate_ports, prepare
+from host.diagnosis.problems import candidate_ports, prepare
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.refits import fit_nominal
 from host.diagnosis.selection.screening import screen

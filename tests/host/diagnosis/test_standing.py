@@ -17,7 +17,7 @@ from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import candidate_ports, prepare
+from host.diagnosis.problems import candidate_ports, prepare
 from host.diagnosis.report.verdict import at_bound, likelier
 from host.diagnosis.selection import equivalence
 from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival, without_improbable
