@@ -32,7 +32,9 @@ from protocol.errors import InputError
 Array = npt.NDArray[np.float64]
 BEGINS = ("position", "speed", "second_place", "second_speed")  # the last two are those of a second mass from the axis
 READ = ("position", "velocity", "acceleration")
-SMOOTHING_S = 0.02
+SMOOTHING_S = 0.02  # longest window of the smoothing,
+SHORTEST = 7  # and samples of the shortest one
+SMOOTH_OVER_NOISE = 2.0  # difference from the smoothed motion, over the noise, from which the window is too long
 UNSEEN_S = 0.05  # least scale of an initial position or speed that is not read
 UNKNOWN = np.array([0.01, 0.05])  # of the range of position and speed, that an input before the recording can have made
 KICK = 100.0  # changes of the usual size that an input makes in one sample, from which it changes the first speed at once
@@ -128,8 +130,7 @@ class AxisModel(Model):
         y = stack(recording, [o.channel for o in self.outputs])
         segment = AxisSegment(recording, y, recording.fit, recording.heldout, filled(recording, names))
         motion = fill(recording.channels[spec.output])
-        window = max(7, round(SMOOTHING_S / recording.dt_s) | 1)
-        x, v, _a = smooth_derivatives(motion, recording.dt_s, window)
+        window, x, v, spread = _smooth(motion, recording.dt_s)
         name = spec.subsystem
         once = _integrated(x, recording.dt_s, 1)
         twice = _integrated(once, recording.dt_s, 2)
@@ -138,7 +139,6 @@ class AxisModel(Model):
         begin = {"position": (x[0], v[0]), "velocity": (0.0, x[0]), "acceleration": (0.0, 0.0)}[spec.reads]
         # Position and speed at the first sample are estimated: one is a derivative of noise, and its error rings on.
         again = self.free_run and spec.controller is None
-        spread = _begin_spread(motion, x, recording.dt_s, window)
         # What is not read is found from the recording; it begins about as large as the integral of the reading gets.
         largest = float(np.max(np.abs(x)))
         if spec.reads == "velocity":
@@ -399,6 +399,22 @@ def _integrated(x: Array, dt_s: float, order: int) -> Array:
     at = np.linspace(-1.0, 1.0, x.size)
     run = np.cumsum(x) * dt_s
     return np.asarray(run - np.polynomial.polynomial.polyval(at, np.polynomial.polynomial.polyfit(at, run, order)))
+
+
+def _smooth(motion: Array, dt_s: float) -> tuple[int, Array, Array, Array]:
+    """Samples of the smoothing window, `motion` (n,) smoothed, its rate, and the standard deviations (2,) of position and
+    speed at the first sample.
+
+    The window is halved until a cubic over it leaves no more than twice the noise: one of 20 ms takes away a mode of 100 Hz,
+    and the first speed with it.
+    """
+    window, noise, spread = max(SHORTEST, round(SMOOTHING_S / dt_s) | 1), reading_noise(motion), np.zeros(2)
+    while True:
+        x, v, _ = smooth_derivatives(motion, dt_s, window)
+        spread = np.maximum(spread, _begin_spread(motion, x, dt_s, window))
+        if window == SHORTEST or float(np.std(motion - x)) <= SMOOTH_OVER_NOISE * noise:
+            return window, x, v, spread
+        window = max(SHORTEST, (window // 2) | 1)
 
 
 def _begin_spread(motion: Array, smooth: Array, dt_s: float, window: int) -> Array:

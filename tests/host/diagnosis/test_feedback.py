@@ -133,7 +133,7 @@ def looped(number: int, coulomb_N: float = 0.0, noise_m: float = 2e-4, load_kg: 
         ({}, []),
         ({"noise_m": 5e-5}, []),
         ({"coulomb_N": 0.6}, ["coulomb_friction"]),
-        ({"load_kg": 0.3, "noise_m": 2e-7}, ["resonance"]),
+        pytest.param({"load_kg": 0.3, "noise_m": 2e-7}, ["resonance"], marks=pytest.mark.long),
     ],
     ids=["nothing", "nothing, less noise", "friction", "a second mass read well"],
 )

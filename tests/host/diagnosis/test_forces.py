@@ -84,7 +84,7 @@ def test_an_arm_that_lacks_nothing_has_nothing_named() -> None:
     assert (verdict.verdict, verdict.effects) == ("nothing_missing", [])
 
 
-@pytest.mark.parametrize("seed", [3, 5])
+@pytest.mark.parametrize("seed", [pytest.param(3, marks=pytest.mark.long), 5])
 def test_a_law_outside_the_vocabulary_is_flagged_in_short_recordings(seed: int) -> None:
     """Friction of the elbow that goes with the shoulder's torque; it is slow, and noise was never recorded alone."""
     recordings = [recorded(10 * seed + k, seconds=4.0) for k in range(2)]

@@ -135,7 +135,7 @@ def value_of(says: str) -> float:
     return float(says.split("recordings say ")[1].split(" ")[0])
 
 
-@pytest.mark.parametrize("wrong", [1.6, 2.3])
+@pytest.mark.parametrize("wrong", [pytest.param(1.6, marks=pytest.mark.long), 2.3])
 def test_a_wrong_mass_is_no_second_mass(wrong: float) -> None:
     verdict = sd.diagnose(shaken(811), axis(mass=held(wrong)))
     assert verdict.verdict == "nothing_missing" and verdict.effects == []
@@ -143,6 +143,7 @@ def test_a_wrong_mass_is_no_second_mass(wrong: float) -> None:
     assert "mass in the nominal file" in verdict.as_dict()["next"]
 
 
+@pytest.mark.long
 def test_one_wrong_value_of_three_is_found() -> None:
     verdict = sd.diagnose(shaken(812), axis(mass=held(2.0), damping=held(15.0), stiffness=held(800.0)))
     assert verdict.verdict == "nothing_missing" and list(stated(verdict)) == ["stiffness"]
@@ -153,7 +154,7 @@ def test_two_wrong_values_are_found() -> None:
     assert verdict.verdict == "nothing_missing" and sorted(stated(verdict)) == ["mass", "stiffness"]
 
 
-@pytest.mark.parametrize("wrong", [3.0, 5.0])
+@pytest.mark.parametrize("wrong", [3.0, pytest.param(5.0, marks=pytest.mark.long)])
 def test_a_wrong_time_constant_is_no_creep(wrong: float) -> None:
     verdict = sd.diagnose(heated(814), plate(tau=held(wrong)))
     assert verdict.verdict == "nothing_missing" and value_of(stated(verdict)["tau"]) == pytest.approx(4.0, rel=5e-3)
@@ -164,7 +165,7 @@ def test_values_that_are_right_are_not_mentioned() -> None:
     assert verdict.verdict == "nothing_missing" and verdict.data_findings == []
 
 
-@pytest.mark.parametrize("mass", [2.0, 1.7])
+@pytest.mark.parametrize("mass", [2.0, pytest.param(1.7, marks=pytest.mark.long)])
 def test_friction_is_named_next_to_held_values(mass: float) -> None:
     verdict = sd.diagnose(shaken(816, friction=8.0), axis(mass=held(mass)))
     assert [effect["id"] for effect in verdict.effects] == ["coulomb_friction"]
@@ -178,3 +179,11 @@ def test_a_known_effect_of_a_wrong_size_is_stated(play: float) -> None:
     known = {"id": "backlash", "at": "gear", "values": {"width_rad": 0.3}, "free": False}
     verdict = sd.diagnose(geared(817, play), gear(effect=[known]))
     assert verdict.verdict == "nothing_missing" and list(stated(verdict)) == ([] if play == 0.3 else ["backlash@gear"])
+
+
+@pytest.mark.long
+def test_a_wrong_time_constant_hides_no_delay() -> None:
+    recordings = [{**r, "y": np.interp(r["t"] - 0.6, r["t"], r["y"])} for r in heated(818)]
+    verdict = sd.diagnose(recordings, plate(tau=held(5.0)))
+    assert [effect["id"] for effect in verdict.effects] == ["latency"] and list(stated(verdict)) == ["tau"]
+    assert next(iter(verdict.effects[0]["parameters"].values()))["value"] == pytest.approx(0.6, abs=0.02)

@@ -140,3 +140,17 @@ def test_a_jump_above_the_noise_around_it_is_found() -> None:
     residual[1900:] += 6.0
     (jump,) = jumps_of([residual], RULES)
     assert abs(jump.sample - 1900) <= 2 and jump.size == pytest.approx(6.0, abs=1.0)
+
+
+@pytest.mark.parametrize("top_Hz", [10.0, 150.0, 300.0])
+def test_the_first_speed_of_a_fast_axis_is_read_from_its_recording(top_Hz: float) -> None:
+    rng, t = np.random.default_rng(7), np.arange(4000) / 2000.0
+    w = 2.0 * np.pi * np.geomspace(3.0, top_Hz, 7) * rng.uniform(0.93, 1.07, 7)
+    response = 1.0 / (2e4 - 0.05 * w**2 + 12j * w)
+    modes = np.exp(1j * (np.outer(t, w) + rng.uniform(0.0, 6.28, 7)))
+    x, v = ((modes @ (factor * response)).real for factor in (1.0, 1j * w))
+    columns = {"t": t, "f": modes.sum(axis=1).real, "x": x + 2e-7 * rng.standard_normal(t.size)}
+    _, problem, _ = prepare(nominal_of(make.axis_nominal()), [Table("r", columns)])
+    begin = problem.segments[0].begin
+    assert begin is not None and abs(begin.measured[1] - v[0]) < 0.1 * np.std(v)
+    assert abs(begin.measured[1] - v[0]) < 2.0 * begin.spread[1]

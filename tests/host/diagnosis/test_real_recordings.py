@@ -67,7 +67,8 @@ def judged(name: str) -> real.SetResult:
     return real.judged(SETS[name], FOLDER)
 
 
-@pytest.mark.parametrize("seal", ["oring", pytest.param("pk", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seal", ["oring", "pk"])
 def test_friction_of_a_seal_grows_with_pressure(seal: str) -> None:
     result = judged(f"pneumatic {seal}")
     assert result.named[0] == "load_dependent_friction" and "stribeck_friction" not in result.named

@@ -101,8 +101,10 @@ def test_engine_cases_without_an_effect_are_adequate(world: str) -> None:
         assert case.size_of(setup, mechanism.left(setup, mechanism.run(setup, [])))[0] < 0.3, mechanism.name
 
 
-@pytest.mark.parametrize("world", ["ode", "mujoco"])
-@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize(
+    ("world", "closed"),
+    [("ode", False), ("ode", True), ("mujoco", False), pytest.param("mujoco", True, marks=pytest.mark.long)],
+)
 def test_what_carries_an_effect_leaves_nothing_itself(world: str, closed: bool) -> None:
     """The shaft of a hanging mass twisted under the torque, an actuator with a lag waited a step: no label named that.
 
