@@ -295,8 +295,9 @@ class _Inspection:
         gain = correlation * float(np.std(y) / np.std(x))
         output_column, input_column = self.columns[path.output], self.columns[path.input]
         if path.gain is not None and correlation * np.sign(path.gain) < self.rules.opposite_correlation:
-            says = f"Column {output_column} moves against column {input_column}; the nominal model says with it. "
-            says += "One of them has the opposite sign (channels.*.sign)."
+            moves, stated = ("against", "positive") if gain < 0.0 else ("with", "negative")
+            says = f"Column {output_column} moves {moves} column {input_column} (gain {gain:.3g}), "
+            says += f"but the nominal gain is {stated}. One of them has the opposite sign (channels.*.sign)."
             self.find("sign", output_column, says)
         if path.gain and abs(correlation) > self.rules.gain_correlation:
             self.units_by_gain(path, path.gain, gain)

@@ -304,8 +304,9 @@ class LinearModel(SimulatedModel):
         assert run.inside is not None
         segment, active = run.inside
         out = [signals[1], signals[0][fed]]
-        changed = [apply_effects(s, active, name, segment, None) for s, name in zip(out, self.inside, strict=True)]
-        return np.array(changed) - np.array(out)
+        with np.errstate(over="ignore", invalid="ignore"):  # a loop that diverges counts as far from every recording
+            changed = [apply_effects(s, active, name, segment, None) for s, name in zip(out, self.inside, strict=True)]
+            return np.array(changed) - np.array(out)
 
     def prepare(self, recording: Any) -> Segment:
         """Prepare a recording as every simulator does; sizes inside the loop are those of the nominal model."""
