@@ -179,7 +179,7 @@ def _without_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -
             fit = fit_nominal(second)
             gain = problem.gain("both", best.residuals, fit.residuals)
             earned = gain.log_likelihood - rules.parameter_penalty * len(each.indices)
-            if gain.p_value < rules.significance and _plausible(spec, second, fit, [each]):
+            if gain.p_value < rules.significance and _plausible(spec, second, fit, [each]) and not _said(begun, fit, each):
                 trials.append((earned, each, second, fit))
         if not trials:
             break
@@ -190,6 +190,14 @@ def _without_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -
     first = begun.found.steps[0].trials if begun.found.best.terms and begun.found.steps else []
     enough = rules.alternative_start_score * max((trial.score for trial in first), default=0.0)
     return freed if score >= enough else []
+
+
+def _said(begun: Searched, fit: Fit, freed: HeldValue) -> bool:
+    """Whether a single effect with as few parameters explains as much as `fit`: the search has judged it already."""
+    problem, rules = begun.problem, begun.problem.rules
+    first = begun.found.steps[0].trials if begun.found.steps else []
+    alike = [trial.fit for trial in first if trial.fit.fitted <= len(freed.indices)]
+    return any(problem.gain("both", a.residuals, fit.residuals).log_likelihood < rules.heldout_log_likelihood for a in alike)
 
 
 def _next_to_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -> list[HeldValue]:
@@ -224,15 +232,16 @@ def _next_to_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -
 
 
 def _likelier(begun: Searched, fit: Fit, freed: Sequence[HeldValue]) -> bool:
-    """Whether `fit`, with `freed` fitted, explains nearly what was found with fewer parameters, or plainly more.
+    """Whether `fit`, with `freed` fitted, explains nearly what was found by fewer parameters and causes, or plainly more.
 
-    Plainly: by as much as an effect has to be likelier, and either by a part of the mismatch that no inexact formula leaves,
-    or down to the noise.
+    A wrong value next to an effect is two causes: a load at the end of an arm is one, with more parameters. Plainly: by as
+    much as an effect has to be likelier, and either by a part of the mismatch that no inexact formula leaves, or down to the
+    noise.
     """
     problem, found, rules = begun.problem, begun.found, begun.problem.rules
     more = fit.fitted + sum(len(each.indices) for each in freed) - found.best.fitted
     ahead = problem.gain("both", found.best.residuals, fit.residuals).log_likelihood - rules.parameter_penalty * more
-    if more >= 0:
+    if more >= 0 or len(fit.terms) + len(freed) > len(found.best.terms):
         removed = mismatch_removed(problem, found.nominal, found.best, fit)
         before, after = (above_noise(problem, each, rules.noise_uncertainty) for each in (found.best, fit))
         return ahead > rules.pooled_log_likelihood and (removed > rules.partial_share or (before and not after))
