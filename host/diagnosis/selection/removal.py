@@ -165,14 +165,14 @@ def _needed(problem: Problem, fit: Fit, term: Term) -> bool:
     """Whether all samples together, and those held out, are sure that `term` is needed next to the other effects.
 
     Two effects that are much alike share an amplitude, whose interval is wide; without one of them the error may be far
-    larger all the same, in all parts of the recordings.
+    larger all the same, in all parts of the recordings. The only effect has to be decisive in a recording that was not
+    fitted: the scatter between halves of two recordings, which can make its interval seven times wider, is a poor measure.
     """
-    if len(fit.terms) == 1:
-        return False
-    begun = get_starts(problem)
+    rules, begun = problem.rules, get_starts(problem)
     _, both, held = _gained(problem, fit, term)
     set_starts(problem, begun)
-    return sure_together(problem.rules, held, both, term.fitted)
+    alone = held.log_likelihood > rules.decisive_log_likelihood and held.p_value < rules.significance
+    return sure_together(rules, held, both, term.fitted) and (len(fit.terms) > 1 or (problem.apart and alone))
 
 
 def drop_unsure_events(problem: Problem, found: Found, candidate_effects: list[Candidate]) -> None:
