@@ -143,9 +143,11 @@ def drop_unsure(problem: Problem, found: Found) -> None:
 
 def unsure(problem: Problem, fit: Fit) -> list[Term]:
     """Terms whose amplitude these recordings do not determine: the interval of an effect of one parameter contains zero, and
-    the other effects could do without it; or that of the only amplitude reaches both of its bounds.
+    the other effects could do without it; or that of the only amplitude reaches both of its bounds, or its lower one and ten
+    times its value.
 
-    The latter is an effect that does what the nominal parameters do, such as a gain that changes where the motion ends.
+    The latter is an effect that does what the nominal parameters do, such as a gain that changes where the motion ends; or a
+    narrow band of noise, such as a load of 0 to 16500 times the drive's mass.
     """
     amplitudes = [(term, [k for k, p in enumerate(term.parameters) if p.linear]) for term in fit.terms]
     single = [(term, places[0]) for term, places in amplitudes if len(places) == 1]
@@ -154,7 +156,8 @@ def unsure(problem: Problem, fit: Fit) -> list[Term]:
     spans, found = intervals(problem, fit), []
     for term, place in single:
         (low, high), p = spans[fit.first_of(term) + place], term.parameters[place]
-        if low <= p.low and p.high <= high:
+        far = problem.rules.undetermined_ratio * abs(float(fit.values[fit.first_of(term) + place]))
+        if low <= p.low and min(p.high, far) <= high:
             found.append(term)
         elif low <= 0.0 <= high and len(term.parameters) == 1 and not _needed(problem, fit, term):
             found.append(term)

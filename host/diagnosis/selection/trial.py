@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain
-from host.diagnosis.estimation.fit import Fit, Problem, Term
+from host.diagnosis.estimation.fit import LARGEST_AMPLITUDE, Fit, Problem, Term, size_of
 from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, same_place
 
@@ -52,9 +52,14 @@ def bound_by(fit: Fit, term: Term) -> bool:
 
 
 def reached(p: Parameter, value: float, natural: bool) -> bool:
-    """Whether `value` is at a bound of `p` that is not a natural one. natural: whether the effect's bounds are."""
+    """Whether `value` is at a bound of `p` that is not a natural one. natural: whether the effect's bounds are.
+
+    An amplitude a thousand times its natural size has run away: fits do not go further.
+    """
     if p.high <= p.low:
         return False
+    if p.linear and abs(value) >= 0.999 * LARGEST_AMPLITUDE * size_of(p, 0.0):
+        return True
     low = np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999)
     high = np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high)
     return bool((low and not p.vanishes and not natural) or (high and (p.shape or not natural)))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from host.diagnosis.estimation.fit import Problem, minimize
+from host.diagnosis.model.effect import Parameter
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.problems import candidates_of, prepare
@@ -13,6 +16,7 @@ from host.diagnosis.selection import removal
 from host.diagnosis.selection.found import Found
 from host.diagnosis.selection.refits import fit_nominal, refined
 from host.diagnosis.selection.screening import term_of
+from host.diagnosis.selection.trial import reached
 from tests.host.proof import everyday as make
 
 
@@ -36,3 +40,20 @@ def test_only_decisive_evidence_outweighs_an_interval(
     monkeypatch.setattr(removal, "intervals", lambda problem, fit: [(-abs(v), 2.0 * abs(v)) for v in fit.values])
     removal.drop_unsure(problem, found)
     assert bool(found.best.terms) == stays
+
+
+@pytest.mark.parametrize(("times", "drops"), [(3.0, False), (20.0, True)])
+def test_an_amplitude_from_zero_to_ten_times_its_value_says_nothing(
+    monkeypatch: pytest.MonkeyPatch, times: float, drops: bool
+) -> None:
+    problem, found = rubbing(0.5)
+    (term,) = found.best.terms
+    (p,) = term.parameters
+    found.best.terms = (replace(term, parameters=(replace(p, low=0.0, high=np.inf),)),)
+    monkeypatch.setattr(removal, "intervals", lambda problem, fit: [(0.0, times * abs(v)) for v in fit.values])
+    assert bool(removal.unsure(problem, found.best)) == drops
+
+
+def test_an_amplitude_at_the_limit_of_fits_is_at_a_bound() -> None:
+    ratio = Parameter("load_ratio", "", (0.5,), 0.0, np.inf, linear=True)
+    assert reached(ratio, 500.0, natural=True) and not reached(ratio, 68.0, natural=True)
