@@ -149,6 +149,7 @@ def test_one_wrong_value_of_three_is_found() -> None:
     assert verdict.verdict == "nothing_missing" and list(stated(verdict)) == ["stiffness"]
 
 
+@pytest.mark.long
 def test_two_wrong_values_are_found() -> None:
     verdict = sd.diagnose(shaken(813), axis(mass=held(1.7), damping=held(15.0), stiffness=held(840.0)))
     assert verdict.verdict == "nothing_missing" and sorted(stated(verdict)) == ["mass", "stiffness"]

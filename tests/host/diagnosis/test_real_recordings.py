@@ -33,6 +33,7 @@ def test_cable_instrument_jaw_angle() -> None:
     assert verdict["fit"]["rmse_after"] < 0.0084
 
 
+@pytest.mark.long
 def test_cable_instrument_torque() -> None:
     _, verdict = run("davinci_torque")
     assert {e["id"] for e in verdict["effects"]} >= {"presliding_friction", "load_dependent_friction"}
