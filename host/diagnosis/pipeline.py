@@ -189,7 +189,8 @@ def _diagnosed(
             done.problem.budget = budget
     done = done or _searched(spec, data, left_out, rules, budget, overall, (0.3 if axis is not None else 0.02, 0.7))
     assert done is not None
-    model, problem, full, found = done.model, done.problem, done.full, done.found
+    problem, full, found = done.problem, done.full, done.found
+    model = problem.model
     overall.part(0.7, 0.75)("comparing rivals in the place of each effect", 0.0)
     standing = most_probable(problem, found)
     named_before = found.best
@@ -336,7 +337,7 @@ def _searched(
     if to_noise and not at_white_noise(problem, found.best if late is None else late.fit):
         return None
     found = concluded(problem, found, candidate_effects, progress)
-    begun = Searched(model, problem, full, found, [*apart, *frozen, *lone, *held])
+    begun = Searched(problem, full, found, [*apart, *frozen, *lone, *held])
     again = Again(spec, recordings, candidate_effects, overall.part(later, high))
     again, begun = past_held_values(again, begun)
     return past_sampling(again, begun)

@@ -13,7 +13,6 @@ import numpy as np
 from host.diagnosis.estimation.fit import Fit, Problem, get_starts, minimize, set_starts
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate
-from host.diagnosis.model.model import Model
 from host.diagnosis.model.nominal import EffectSpec, NominalSpec
 from host.diagnosis.model.readings import Finding
 from host.diagnosis.problems import problems
@@ -33,7 +32,6 @@ Progress = Callable[[str, float], None]
 class Searched:
     """What was searched, and what was found in it."""
 
-    model: Model
     problem: Problem
     full: Problem
     found: Found
@@ -117,15 +115,12 @@ def _past_delay(again: Again, late: Trial, begun: Searched) -> Searched | None:
         id=candidate.effect.id, at=candidate.port.name, values=values, source=candidate.source, form=candidate.form
     )
     extended = again.spec.model_copy(update={"effect": [*again.spec.effect, known]})
-    model, second, full = problems(extended, again.recordings, problem.rules)
-    second.budget, second.joint_states = problem.budget, problem.joint_states
-    for each in (second, full) if model.holds else ():
-        model.hold_as(each.segments, problem.model.hold)
+    second, full = _problems_of(extended, again, begun)
     place = {*candidate.port.path, candidate.port.name}
     others = [c for c in again.candidates if not (c.effect.shifts and (c.port.held or c.port.name in place))]
     found = search(second, others, again.progress, late.both.log_likelihood)
     own = [t for t in found.best.terms if not (t.candidate.effect.invariant and t.candidate.port.name in place)]
-    delay_s = found.best.values[len(problem.model.parameters) : len(model.parameters)]
+    delay_s = found.best.values[len(problem.model.parameters) : len(second.model.parameters)]
     late_s = float(np.max(delay_s, initial=0.0))
     if not own or late_s > problem.rules.sampling_delay * problem.segments[0].recording.dt_s:
         return None
@@ -135,7 +130,17 @@ def _past_delay(again: Again, late: Trial, begun: Searched) -> Searched | None:
     if ahead < -max(rules.heldout_log_likelihood, rules.refinement_tolerance * earned):
         return None
     said = [*begun.findings, *late_by_a_sample(second, late, past=True)]
-    return replace(begun, model=model, problem=second, full=full, found=found, findings=said)
+    return replace(begun, problem=second, full=full, found=found, findings=said)
+
+
+def _problems_of(spec: NominalSpec, again: Again, begun: Searched) -> tuple[Problem, Problem]:
+    """The problems of an extended nominal model, at the rate that is fitted and at the full one; all else as in `begun`."""
+    problem = begun.problem
+    model, second, full = problems(spec, again.recordings, problem.rules)
+    second.budget, second.joint_states = problem.budget, problem.joint_states
+    for each in (second, full) if model.holds else ():
+        model.hold_as(each.segments, problem.model.hold)
+    return second, full
 
 
 def past_held_values(again: Again, begun: Searched) -> tuple[Again, Searched]:
@@ -156,15 +161,14 @@ def past_held_values(again: Again, begun: Searched) -> tuple[Again, Searched]:
         freed = promising(problem, found.best, held, 1)
     if not freed or problem.budget.spent():
         return again, begun
-    extended, second, full = _with_free(again, begun, freed)
+    extended = with_free(again.spec, freed)
+    second, full = _problems_of(extended, again, begun)
     other = search(second, again.candidates, again.progress)
     if not _likelier(begun, other.best, freed) or not _plausible(extended, second, other.best, freed):
         return again, begun
     held_at = tuple(float(found.nominal.values[index]) for each in freed for index in each.indices)
     said = Freed(tuple(freed), held_at, found.nominal.residuals)
-    return replace(again, spec=extended), replace(
-        begun, model=second.model, problem=second, full=full, found=other, freed=said
-    )
+    return replace(again, spec=extended), replace(begun, problem=second, full=full, found=other, freed=said)
 
 
 def _without_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -> list[HeldValue]:
@@ -175,7 +179,8 @@ def _without_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -
         left = [each for each in held if each not in freed]
         trials = []
         for each in promising(now, best, left, rules.held_values_tried):
-            spec, second, _ = _with_free(again, begun, [*freed, each])
+            spec = with_free(again.spec, [*freed, each])
+            second, _ = _problems_of(spec, again, begun)
             fit = fit_nominal(second)
             gain = problem.gain("both", best.residuals, fit.residuals)
             earned = gain.log_likelihood - rules.parameter_penalty * len(each.indices)
@@ -219,7 +224,8 @@ def _next_to_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -
             if problem.budget.spent():
                 break
             if each.name not in freed:
-                freed[each.name] = _with_free(again, begun, [each])[:2]
+                spec = with_free(again.spec, [each])
+                freed[each.name] = spec, _problems_of(spec, again, begun)[0]
                 fit_nominal(freed[each.name][1])
             spec, second = freed[each.name]
             set_starts(second, starts)
@@ -247,16 +253,6 @@ def _likelier(begun: Searched, fit: Fit, freed: Sequence[HeldValue]) -> bool:
         return ahead > rules.pooled_log_likelihood and (removed > rules.partial_share or (before and not after))
     earned = problem.gain("both", found.nominal.residuals, found.best.residuals).log_likelihood
     return ahead > -max(rules.heldout_log_likelihood, rules.refinement_tolerance * earned)
-
-
-def _with_free(again: Again, begun: Searched, freed: Sequence[HeldValue]) -> tuple[NominalSpec, Problem, Problem]:
-    """The nominal model with these values fitted, and its problems, at the rate that is fitted and at the full one."""
-    spec, problem = with_free(again.spec, freed), begun.problem
-    model, second, full = problems(spec, again.recordings, problem.rules)
-    second.budget, second.joint_states = problem.budget, problem.joint_states
-    for each in (second, full) if model.holds else ():
-        model.hold_as(each.segments, problem.model.hold)
-    return spec, second, full
 
 
 def _plausible(spec: NominalSpec, problem: Problem, fit: Fit, freed: Sequence[HeldValue]) -> bool:

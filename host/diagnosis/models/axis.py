@@ -408,7 +408,8 @@ def _smooth(motion: Array, dt_s: float) -> tuple[int, Array, Array, Array]:
     The window is halved until a cubic over it leaves no more than twice the noise: one of 20 ms takes away a mode of 100 Hz,
     and the first speed with it.
     """
-    window, noise, spread = max(SHORTEST, round(SMOOTHING_S / dt_s) | 1), reading_noise(motion), np.zeros(2)
+    window, spread = max(SHORTEST, round(SMOOTHING_S / dt_s) | 1), np.zeros(2)
+    noise = 0.0 if window == SHORTEST else reading_noise(motion)
     while True:
         x, v, _ = smooth_derivatives(motion, dt_s, window)
         spread = np.maximum(spread, _begin_spread(motion, x, dt_s, window))

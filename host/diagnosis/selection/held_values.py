@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.fit import RATE_STEP, Fit, Problem, free_states, jacobian, size_of
+from host.diagnosis.estimation.fit import Fit, Problem, free_states, jacobian, rate, size_of
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.readings import Finding
@@ -74,8 +74,7 @@ def promising(problem: Problem, fit: Fit, held: Sequence[HeldValue], most: int) 
 
     The part is that which neither the parameters of `fit` nor the states that recordings begin with can explain.
     """
-    parameters = problem.parameters(fit.terms)
-    sizes = [size_of(p, v) for p, v in zip(parameters, fit.values, strict=True)]
+    sizes = [size_of(p, v) for p, v in zip(problem.parameters(fit.terms), fit.values, strict=True)]
     base = problem.stacked(fit.terms, fit.values)
     states = free_states(problem, fit.terms, fit.values)
     known = [jacobian(problem, fit.terms, fit.values, base, sizes), *([] if states is None else [states.rates])]
@@ -83,12 +82,7 @@ def promising(problem: Problem, fit: Fit, held: Sequence[HeldValue], most: int) 
     r = base - frame @ (frame.T @ base)
     promises = []
     for each in held:
-        columns = []
-        for index in each.indices:
-            moved = fit.values.copy()
-            moved[index] += RATE_STEP * size_of(parameters[index], fit.values[index])
-            columns.append(base - problem.stacked(fit.terms, moved))
-        C = np.array(columns).T
+        C = np.array([rate(problem, fit.terms, fit.values, base, index, sizes[index]) for index in each.indices]).T
         C = np.linalg.qr(C - frame @ (frame.T @ C))[0]
         promises.append(float(np.sum((C.T @ r) ** 2)))
     order = np.argsort(promises)[::-1][:most]

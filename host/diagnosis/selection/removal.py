@@ -155,8 +155,8 @@ def unsure(problem: Problem, fit: Fit) -> list[Term]:
         return []
     spans, found = intervals(problem, fit), []
     for term, place in single:
-        (low, high), p = spans[fit.first_of(term) + place], term.parameters[place]
-        far = problem.rules.undetermined_ratio * abs(float(fit.values[fit.first_of(term) + place]))
+        index, p = fit.first_of(term) + place, term.parameters[place]
+        (low, high), far = spans[index], problem.rules.undetermined_ratio * abs(float(fit.values[index]))
         if low <= p.low and min(p.high, far) <= high:
             found.append(term)
         elif low <= 0.0 <= high and len(term.parameters) == 1 and not _needed(problem, fit, term):
@@ -171,11 +171,14 @@ def _needed(problem: Problem, fit: Fit, term: Term) -> bool:
     larger all the same, in all parts of the recordings. The only effect has to be decisive in a recording that was not
     fitted: the scatter between halves of two recordings, which can make its interval seven times wider, is a poor measure.
     """
-    rules, begun = problem.rules, get_starts(problem)
+    only, rules = len(fit.terms) == 1, problem.rules
+    if only and not problem.apart:
+        return False
+    begun = get_starts(problem)
     _, both, held = _gained(problem, fit, term)
     set_starts(problem, begun)
-    alone = held.log_likelihood > rules.decisive_log_likelihood and held.p_value < rules.significance
-    return sure_together(rules, held, both, term.fitted) and (len(fit.terms) > 1 or (problem.apart and alone))
+    decisive = held.log_likelihood > rules.decisive_log_likelihood and held.p_value < rules.significance
+    return sure_together(rules, held, both, term.fitted) and (decisive or not only)
 
 
 def drop_unsure_events(problem: Problem, found: Found, candidate_effects: list[Candidate]) -> None:

@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 import seldinger as sd
+from tests.host.proof import everyday as make
 from tests.host.proof.everyday import stream
 
 Array = np.ndarray
@@ -52,21 +53,8 @@ def shaken(seed: int, stiffness: float = 900.0, friction: float = 0.0) -> list[C
 
 
 def axis(**parameters: Any) -> dict[str, Any]:
-    """A nominal mass, damper and spring."""
-    return {
-        "name": "stage",
-        "kind": "axis",
-        "data": {"time": "t"},
-        "channels": {"force": {"column": "f", "unit": "N"}, "place": {"column": "x", "unit": "m"}},
-        "axis": {
-            "subsystem": "stage",
-            "input": "force",
-            "output": "place",
-            "terms": ["mass", "damping", "stiffness", "offset"],
-            "hold": "linear",
-        },
-        "parameters": {"mass": 2.0, "damping": 15.0, "stiffness": 900.0, **parameters},
-    }
+    """The nominal mass, damper and spring of `shaken`, all fitted but for those of `parameters` that are held."""
+    return make.axis_nominal(**{"mass": 2.0, "damping": 15.0, "stiffness": 900.0, **parameters})
 
 
 def heated(seed: int) -> list[Columns]:
@@ -80,23 +68,10 @@ def heated(seed: int) -> list[Columns]:
     return out
 
 
-def plate(**parameters: Any) -> dict[str, Any]:
-    """A nominal first-order lag."""
-    return {
-        "name": "plate",
-        "kind": "linear",
-        "data": {"time": "t"},
-        "channels": {"power": {"column": "u", "unit": "W"}, "warmth": {"column": "y", "unit": "K"}},
-        "linear": {
-            "subsystem": "plate",
-            "inputs": ["power"],
-            "outputs": ["warmth"],
-            "numerator": ["gain"],
-            "denominator": ["tau", 1.0],
-            "hold": "zero",
-        },
-        "parameters": {"gain": 0.08, "tau": 4.0, **parameters},
-    }
+def plate(tau: dict[str, Any]) -> dict[str, Any]:
+    """The nominal first-order lag of `heated`, its time constant (s) as `tau` says."""
+    nominal = make.first_order_nominal("W", "K", 0.08, 4.0)
+    return {**nominal, "parameters": {**nominal["parameters"], "tau": tau}}
 
 
 def geared(seed: int, play: float) -> list[Columns]:
@@ -113,16 +88,8 @@ def geared(seed: int, play: float) -> list[Columns]:
 
 
 def gear(**more: Any) -> dict[str, Any]:
-    """A nominal gear."""
-    return {
-        "name": "gear",
-        "kind": "transmission",
-        "data": {"time": "t"},
-        "channels": {"turn": {"column": "motor", "unit": "rad"}, "load": {"column": "load", "unit": "rad"}},
-        "link": [{"subsystem": "gear", "input": "turn", "output": "load"}],
-        "parameters": {"gain": 1.3},
-        **more,
-    }
+    """The nominal gear of `geared` with `more` sections, such as known effects."""
+    return {**make.gear_nominal(gain=1.3), **more}
 
 
 def stated(verdict: sd.Verdict) -> dict[str, str]:
@@ -157,7 +124,7 @@ def test_two_wrong_values_are_found() -> None:
 
 @pytest.mark.parametrize("wrong", [3.0, pytest.param(5.0, marks=pytest.mark.long)])
 def test_a_wrong_time_constant_is_no_creep(wrong: float) -> None:
-    verdict = sd.diagnose(heated(814), plate(tau=held(wrong)))
+    verdict = sd.diagnose(heated(814), plate(held(wrong)))
     assert verdict.verdict == "nothing_missing" and value_of(stated(verdict)["tau"]) == pytest.approx(4.0, rel=5e-3)
 
 
@@ -185,6 +152,6 @@ def test_a_known_effect_of_a_wrong_size_is_stated(play: float) -> None:
 @pytest.mark.long
 def test_a_wrong_time_constant_hides_no_delay() -> None:
     recordings = [{**r, "y": np.interp(r["t"] - 0.6, r["t"], r["y"])} for r in heated(818)]
-    verdict = sd.diagnose(recordings, plate(tau=held(5.0)))
+    verdict = sd.diagnose(recordings, plate(held(5.0)))
     assert [effect["id"] for effect in verdict.effects] == ["latency"] and list(stated(verdict)) == ["tau"]
     assert next(iter(verdict.effects[0]["parameters"].values()))["value"] == pytest.approx(0.6, abs=0.02)
