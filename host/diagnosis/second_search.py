@@ -18,7 +18,7 @@ from host.diagnosis.model.readings import Finding
 from host.diagnosis.problems import problems
 from host.diagnosis.selection.equivalence import mismatch_removed
 from host.diagnosis.selection.found import Found
-from host.diagnosis.selection.held_values import DECADE, Freed, HeldValue, contradicted, held_values, promising, with_free
+from host.diagnosis.selection.held_values import FARTHEST, Freed, HeldValue, contradicted, held_values, promising, with_free
 from host.diagnosis.selection.refits import fit_nominal, fit_without, refined
 from host.diagnosis.selection.sampling import late_by_a_sample
 from host.diagnosis.selection.screening import above_noise
@@ -158,7 +158,7 @@ def past_held_values(again: Again, begun: Searched) -> tuple[Again, Searched]:
     if found.best.terms and not freed:
         freed = _next_to_effects(again, begun, held)
     if not freed and above_noise(problem, found.best, rules.noise_uncertainty):
-        freed = promising(problem, found.best, held, 1)
+        freed = [each for each in promising(problem, found.best, held, 1) if _gains(again, begun, each)]
     if not freed or problem.budget.spent():
         return again, begun
     extended = with_free(again.spec, freed)
@@ -195,6 +195,17 @@ def _without_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -
     first = begun.found.steps[0].trials if begun.found.best.terms and begun.found.steps else []
     enough = rules.alternative_start_score * max((trial.score for trial in first), default=0.0)
     return freed if score >= enough else []
+
+
+def _gains(again: Again, begun: Searched, each: HeldValue) -> bool:
+    """Whether fitting a held value next to all that was found takes enough from what they leave to search again."""
+    problem, best, begin = begun.problem, begun.found.best, get_starts(begun.problem)
+    second, _ = _problems_of(with_free(again.spec, [each]), again, begun)
+    fit_nominal(second)
+    set_starts(second, begin)
+    fit = refined(second, minimize(second, best.terms, best.values))
+    gain = problem.gain("both", best.residuals, fit.residuals)
+    return gain.log_likelihood > problem.rules.pooled_log_likelihood and gain.p_value < problem.rules.significance
 
 
 def _said(begun: Searched, fit: Fit, freed: HeldValue) -> bool:
@@ -256,13 +267,13 @@ def _likelier(begun: Searched, fit: Fit, freed: Sequence[HeldValue]) -> bool:
 
 
 def _plausible(spec: NominalSpec, problem: Problem, fit: Fit, freed: Sequence[HeldValue]) -> bool:
-    """Whether each fitted value is within its bounds, and a parameter of the model within a decade of what was held."""
+    """Whether each fitted value is within its bounds, and a parameter of the model within two decades of what was held."""
     parameters = problem.model.parameters
     for each in freed:
         for index in each.indices:
             p, value = parameters[index], float(fit.values[index])
             if not p.low < value < p.high:
                 return False
-            if each.effect is None and not 1.0 / DECADE < value / spec.parameters[each.name].value < DECADE:
+            if each.effect is None and not 1.0 / FARTHEST < value / spec.parameters[each.name].value < FARTHEST:
                 return False
     return True

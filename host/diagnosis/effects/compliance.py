@@ -14,6 +14,17 @@ def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
     return (Parameter("compliance", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), linear=True),)
 
 
+def spring(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Return the stiffness: force per deflection."""
+    size = s.need / (0.5 * s.motion_span)
+    return (Parameter("stiffness", f"{s.unit}/{s.motion_unit}", (size,), 0.0, np.inf, linear=True),)
+
+
+def slots(p: Array, form: str) -> dict[str, float]:
+    """Force per deflection."""
+    return {"spring": p[0]}
+
+
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """The output gives way by p[0] load."""
     return np.asarray(signal + p[0] * c.load)
@@ -23,4 +34,15 @@ SAYS = "There is a spring between input and output: {source} deflects the output
 EFFECTS = (
     Effect("compliance", "motion", 70, per_load, SAYS, "y = x + compliance*load", apply, side="output", source="load"),
     Effect("compliance", "mix", 20, per_load, SAYS, "y = x + compliance*load", apply, source="load"),
+    Effect(
+        "compliance",
+        "force",
+        19,
+        spring,
+        "A spring of {stiffness} pulls towards one place.",
+        "F = stiffness*x",
+        slots=slots,
+        forms=("spring",),
+        of_law=True,
+    ),
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numba import njit
@@ -169,11 +170,15 @@ EFFECTS = (
         apply,
     ),
     _TURNING,
-    in_form(
-        _TURNING,
-        "constant",
-        "A constant force of {force} acts against the positive direction, as of a weight or an offset of the input.",
-        "F = force",
+    replace(
+        in_form(
+            _TURNING,
+            "constant",
+            "A constant force of {force} acts against the positive direction, as of a weight or an offset of the input.",
+            "F = force",
+        ),
+        of_law=True,
+        order=80,  # after an offset of the reading, which does the same where a spring holds the axis
     ),
     COMPONENT,
 )

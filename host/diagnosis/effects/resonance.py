@@ -189,5 +189,6 @@ EFFECTS = (
         filters=True,
         timed=True,
         forms=("mass",),
+        of_law=True,
     ),
 )

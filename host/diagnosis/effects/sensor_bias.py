@@ -111,6 +111,7 @@ EFFECTS = (
         apply,
         at_rest=True,
         invariant=True,
+        of_law=True,
         affine=True,
     ),
     Effect(

@@ -42,6 +42,7 @@ _LINEAR = Effect(
     slots=slots,
     timed=True,
     dissipates=True,
+    of_law=True,
 )
 EFFECTS = (
     Effect(
@@ -65,5 +66,6 @@ EFFECTS = (
             "F = coefficient*v*|v|",
         ),
         extended=True,
+        of_law=False,
     ),
 )

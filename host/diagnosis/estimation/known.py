@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,17 @@ class Known(Model):
     def settle(self, segment: Segment, theta: Array) -> None:
         """Call the model without the known effects."""
         self._inner.settle(segment, theta[: self.own])
+
+    def along_motion(self) -> Model | None:
+        """That of the model without the known effects, with them at work."""
+        inner = self._inner.along_motion()
+        if inner is None or inner is self._inner:
+            return None if inner is None else self
+        other = copy(self)
+        for name in Model.__annotations__:
+            setattr(other, name, getattr(inner, name))
+        other._inner, other.parameters, other.taken = inner, self.parameters, self.taken
+        return other
 
     def noise_of_inputs(self, segment: Segment, theta: Array) -> Array:
         """Call the model without the known effects."""

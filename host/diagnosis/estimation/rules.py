@@ -143,6 +143,8 @@ class SelectionRules:
     wider_fits: int = 4  # other forms that are fitted where one that the data call for ended at a bound
     joint_first: int = 2  # of them, of unlike families, past which further effects are looked for,
     joint_second: int = 3  # and how many of these are fitted
+    astray_ratio: float = 1.5  # error of the forces by the parameters of a simulated motion, over that by their own, from
+    # which a fit starts from the latter
     nominal_restarts: int = 3  # starts of the nominal parameters kept for an effect that hides them
     crossed_folds: int = 4  # groups of recordings that are predicted from the others, at most
     crossed_fits: int = 4  # best candidates that are cross-validated where the recordings held out show nothing of them

@@ -187,6 +187,7 @@ class Effect:
     rounded: bool = False  # a law without its corner: it takes the place of that law where the data call for it
     # Start values from the parameters of a mode of the drive that may be taken for it, and how late (s) the drive then is.
     as_mode: Callable[[dict[str, float]], tuple[dict[str, float], float] | None] | None = None
+    of_law: bool = False  # a term that a nominal law can have itself, as exact as those that it has
     affine: bool = False  # a reading times a constant plus a constant: a state that is read begins elsewhere with it
 
     @property

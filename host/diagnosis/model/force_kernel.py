@@ -63,6 +63,7 @@ SLOTS = (
     "smooth_stribeck",
     "smooth_power",
     "bristle_damping",
+    "spring",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -116,6 +117,7 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     SMOOTH_STRIBECK,
     SMOOTH_POWER,
     BRISTLE_DAMPING,
+    SPRING,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
@@ -128,6 +130,7 @@ class SmoothLaw(NamedTuple):
     damping: float
     drag: float
     asymmetry: float
+    spring: float
     quadratic: float
     cubic: float
     constant: float
@@ -154,6 +157,7 @@ def smooth_law(p: Array) -> SmoothLaw:
         p[VISCOUS],
         p[DRAG],
         p[ASYMMETRY],
+        p[SPRING],
         p[QUADRATIC],
         p[CUBIC],
         p[CONSTANT],
@@ -179,7 +183,11 @@ def smooth_force(x: float, v: float, t: float, slow: float, law: SmoothLaw) -> f
     """Force without dry friction: against the motion, to be overcome by the input. `slow`: x after the lag of the
     Maxwell branch.
     """
-    force = (law.damping + law.drag * abs(v)) * v + law.asymmetry * abs(v) + (law.quadratic + law.cubic * x) * x * x
+    force = (
+        (law.damping + law.drag * abs(v)) * v
+        + law.asymmetry * abs(v)
+        + (law.spring + (law.quadratic + law.cubic * x) * x) * x
+    )
     force += law.constant + law.branch * (x - slow) + law.softening * t * x
     force -= law.stiffness * min(max(x, -law.gap), law.gap)
     if law.per_place > 0.0:
@@ -407,7 +415,7 @@ class ForcedAxis(NamedTuple):
 def _axis_of(linear: Array, p: Array) -> ForcedAxis:
     """The axis of the nominal parameters `linear` (m, c, k, offset) and the parameter array `p`."""
     m, c, k = linear[0], linear[1], linear[2]
-    q = ((c + p[VISCOUS]) / m, p[DRAG] / m, p[ASYMMETRY] / m, k / m, p[QUADRATIC] / m, p[CUBIC] / m)
+    q = ((c + p[VISCOUS]) / m, p[DRAG] / m, p[ASYMMETRY] / m, (k + p[SPRING]) / m, p[QUADRATIC] / m, p[CUBIC] / m)
     k2, c2 = p[OMEGA2] * p[OMEGA2], 2.0 * p[DAMPING2] * p[OMEGA2]
     return ForcedAxis(m, c, k, p[MASS2], k2, c2, smooth_law(p), q, polynomial(p))
 

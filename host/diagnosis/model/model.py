@@ -170,6 +170,10 @@ class Model(ABC):
         """Further start values of the nominal parameters: for effects that hide them, and where the guess fails."""
         return []
 
+    def along_motion(self) -> Model | None:
+        """The same law compared along the measured motion, where no simulation leads a fit astray; None if there is none."""
+        return None
+
     def noise_of(self, segment: Segment) -> Any:
         """Noise (`estimation.noise.Noise`) of a difference that the model itself makes; None: estimated from the output."""
         return None

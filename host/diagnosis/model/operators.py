@@ -439,7 +439,13 @@ def least_error_window(x: Array, dt_s: float, sigma: float, degree: int, order: 
 
 
 def smooth_derivatives(x: Array, dt_s: float, window: int, degree: int = 3) -> tuple[Array, Array, Array]:
-    """Position, velocity, acceleration of a measured motion by a local polynomial over `window` samples (odd).
+    """Position, velocity, acceleration (n,) of a measured motion, see `smooth_derivative`."""
+    place, speed, acceleration = (smooth_derivative(x, dt_s, window, order, degree) for order in range(3))
+    return place, speed, acceleration
+
+
+def smooth_derivative(x: Array, dt_s: float, window: int, order: int, degree: int = 3) -> Array:
+    """Derivative (n,) of `order` of a measured motion by a local polynomial over `window` samples (odd).
 
     It has no phase. Over 7 samples a cubic takes 2 % of an acceleration at a fortieth of the sampling rate; degree 5
     takes 0.03 % and passes more noise.
@@ -447,8 +453,7 @@ def smooth_derivatives(x: Array, dt_s: float, window: int, degree: int = 3) -> t
     from scipy.signal import savgol_filter
 
     window = max(degree + 2, min(window | 1, (x.size - 1) | 1))
-    smooth = [savgol_filter(x, window, degree, deriv=d, delta=dt_s, mode="interp") for d in (0, 1, 2)]
-    return smooth[0], smooth[1], smooth[2]
+    return np.asarray(savgol_filter(x, window, degree, deriv=order, delta=dt_s, mode="interp"))
 
 
 def wander_at_rest(x: Array, smooth: Array, window: int, degree: int = 3) -> float:

@@ -18,7 +18,7 @@ from scipy.signal import savgol_coeffs
 from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import fill, smooth_derivatives, smoothing_window, white_level
+from host.diagnosis.model.operators import fill, smooth_derivative, smooth_derivatives, smoothing_window, white_level
 
 Array = npt.NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def lead_by_gain(recording: Recording, path: Pair, rules: DataRules) -> float:
         return 0.0
     dt = recording.dt_s
     window = smoothing_window(x, dt, white_level(x), 7 * dt)
-    smooth_x, smooth_y = (smooth_derivatives(signal, dt, window)[0] for signal in (x, y))
+    smooth_x, smooth_y = (smooth_derivative(signal, dt, window, 0) for signal in (x, y))
     line, at = CubicSpline(np.arange(x.size), smooth_x), np.arange(x.size - best - 1)
     return _between_samples(lambda lead: _left(line(at + lead), smooth_y[at]), best)[0]
 
@@ -233,7 +233,7 @@ def regression(recording: Recording, path: Pair, exchanged: bool = False) -> Law
         force, motion = motion, force
     dt = recording.dt_s
     window = smoothing_window(motion, dt, white_level(motion), 7 * dt)
-    f = smooth_derivatives(force, dt, window)[0]
+    f = smooth_derivative(force, dt, window, 0)
     inside = slice(window, -window) if f.size > 6 * window else slice(None)
     found, rms, explained = _least_squares(_terms(path, motion, dt, window)[:, inside], f[inside])
     return LawFit(found[:-1], rms[:-1], explained)
@@ -250,7 +250,7 @@ def sides_of_law(recording: Recording, path: Pair, window: int) -> tuple[Array, 
     if path.reads == "acceleration":
         terms, force = _by_spectra(recording, path)
         return np.vstack([terms, np.ones_like(force)]), force
-    return _terms(path, y, recording.dt_s, window), smooth_derivatives(x, recording.dt_s, window)[0]
+    return _terms(path, y, recording.dt_s, window), smooth_derivative(x, recording.dt_s, window, 0)
 
 
 def _terms(path: Pair, motion: Array, dt: float, window: int) -> Array:
@@ -362,7 +362,7 @@ def lead_by_law(recording: Recording, path: Pair, leading: str, rules: DataRules
         """RMS that the law leaves of a force that comes `shift` samples later than its motion."""
         return left(signal[edge + shift : signal.size - edge + shift])
 
-    smooth, passed = smooth_derivatives(force, dt, window)[0], float(np.linalg.norm(savgol_coeffs(window, 3)))
+    smooth, passed = smooth_derivative(force, dt, window, 0), float(np.linalg.norm(savgol_coeffs(window, 3)))
     ratio, over = rules.clock_residual_ratio, rules.clock_over_noise
     levels = [(force, shifted(force, 0), over * noise), (smooth, shifted(smooth, 0), over * passed * noise)]
     if all(clean > ratio * now for _, now, clean in levels):

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.integrate import cumulative_trapezoid
 
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
-from host.diagnosis.model.force_kernel import run_axis, slot_array
+from host.diagnosis.model.force_kernel import SPRING, run_axis, slot_array
 from host.diagnosis.model.model import (
     ActiveEffect,
     Begin,
@@ -67,17 +68,19 @@ class AxisModel(Model):
 
     kind = "axis"
 
-    def __init__(self, spec: NominalSpec) -> None:
+    def __init__(self, spec: NominalSpec, along: bool = False) -> None:
+        """along: whether the force is compared that the measured motion needs, also where a spring holds the axis."""
         if spec.axis is None:
             raise ValueError("axis: found nothing, wanted a section")
-        self.spec = spec.axis
+        self.nominal, self.spec = spec, spec.axis
         self.hold: str = spec.axis.hold or "linear"
         self.hold_stated = spec.axis.hold is not None
         self.holds = balance.HOLDS if spec.axis.controller is None else ()
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
+        self.reads = "position" if along else self.spec.reads  # a speed is integrated, to be compared along the motion
         force, motion, name = self.units[self.spec.input], self.units[self.spec.output], self.spec.subsystem
         place = integral_unit(motion, READ.index(self.spec.reads))
-        self.free_run = not self.spec.runs_away or self.spec.compare == "motion"
+        self.free_run = not along and (not self.spec.runs_away or self.spec.compare == "motion")
         self.driven = self.free_run and self.spec.controller is None
         outputs = [Output(self.spec.output, motion, name)] if self.free_run else []
         if self.spec.controller is not None or not self.free_run:
@@ -111,11 +114,10 @@ class AxisModel(Model):
             parameters.append(Parameter(term, defaults[term][1], (value,), low, high, log=term != "offset" and free))
         self.given = [term for term in self.spec.terms if term in spec.parameters]
         self.parameters = tuple(parameters)
+        stiff, offset = ("stiffness" in self.spec.terms), ("offset" in self.spec.terms)
         self.taken = frozenset(["viscous_friction:"] if "damping" in self.spec.terms else [])
-        if "stiffness" not in self.spec.terms:
-            self.taken |= {"softening:", "contact_nonlinear:"}
-        if "stiffness" in self.spec.terms or "offset" in self.spec.terms:  # it is an offset of the reading, or nominal
-            self.taken |= {"gravity_load:constant"}
+        self.taken |= {"compliance:spring"} if stiff else {"softening:", "contact_nonlinear:"}
+        self.taken |= {"gravity_load:constant"} if offset else frozenset()
         self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", place),)
         self.unlisted_at = ((name, f"{name}_drive"),) if self.spec.controller is None else ()
         self.moves = {name: self.spec.output}
@@ -130,27 +132,29 @@ class AxisModel(Model):
         y = stack(recording, [o.channel for o in self.outputs])
         segment = AxisSegment(recording, y, recording.fit, recording.heldout, filled(recording, names))
         motion = fill(recording.channels[spec.output])
+        if self.reads != spec.reads:
+            motion = cumulative_trapezoid(motion, dx=recording.dt_s, initial=0.0)
         window, x, v, spread = _smooth(motion, recording.dt_s)
         name = spec.subsystem
         once = _integrated(x, recording.dt_s, 1)
         twice = _integrated(once, recording.dt_s, 2)
-        place = {"position": x, "velocity": np.cumsum(x) * recording.dt_s, "acceleration": twice}[spec.reads]
+        place = {"position": x, "velocity": np.cumsum(x) * recording.dt_s, "acceleration": twice}[self.reads]
         segment.inputs[f"motion:{name}"] = place
-        begin = {"position": (x[0], v[0]), "velocity": (0.0, x[0]), "acceleration": (0.0, 0.0)}[spec.reads]
+        begin = {"position": (x[0], v[0]), "velocity": (0.0, x[0]), "acceleration": (0.0, 0.0)}[self.reads]
         # Position and speed at the first sample are estimated: one is a derivative of noise, and its error rings on.
         again = self.free_run and spec.controller is None
         # What is not read is found from the recording; it begins about as large as the integral of the reading gets.
         largest = float(np.max(np.abs(x)))
-        if spec.reads == "velocity":
+        if self.reads == "velocity":
             spread = np.array([max(largest * UNSEEN_S, float(np.std(once))), spread[0]])
-        elif spec.reads == "acceleration":
+        elif self.reads == "acceleration":
             spread = np.array(
                 [max(largest * UNSEEN_S**2, float(np.std(twice))), max(largest * UNSEEN_S, float(np.std(once)))]
             )
         elif spec.compare == "motion":  # a delay puts the unknown input before the recording into its first moments
             spread = np.maximum(spread, UNKNOWN * np.array([np.ptp(x), np.ptp(v)]))
         kick = np.abs(np.diff(segment.inputs[spec.input][: window + 1]))
-        if spec.reads == "position" and np.max(kick) > KICK * np.median(np.abs(np.diff(segment.inputs[spec.input]))):
+        if self.reads == "position" and np.max(kick) > KICK * np.median(np.abs(np.diff(segment.inputs[spec.input]))):
             spread[1] = max(spread[1], abs(v[0]))  # the window reads the speed behind the kick, not that before it
         # A second mass on a spring moves before the recording, too. Near its mode it may be elsewhere by all of the motion.
         apart = np.array([np.ptp(place), np.ptp(np.gradient(place, recording.dt_s))])
@@ -160,9 +164,9 @@ class AxisModel(Model):
         )
         segment.x, segment.v, segment.a = x, v, np.gradient(v, recording.dt_s)
         segment.substeps = self._substeps(segment)
-        along = motion if spec.reads == "position" else place
+        along = motion if self.reads == "position" else place
         segment.tolerances[name] = tolerance_of(along, float(np.ptp(along)))
-        if spec.reads == "position":
+        if self.reads == "position":
             segment.tolerances[name] = max(segment.tolerances[name], wander_at_rest(motion, x, window))
         segment.units = {
             **self.units,
@@ -181,8 +185,10 @@ class AxisModel(Model):
             segment.force_noise = recorded - calm(recorded, level, 1.0)
             segment.fine_force_noise = recorded - smoothed(recorded, level)
             segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
-            segment.rests = balance.at_rest(x, segment.tolerances[name], segment.balance.support.size // 2)
-            segment.spread, segment.read_motion = segment.balance.support.size // 2, recording.channels[spec.output]
+            half = segment.balance.support.size // 2
+            segment.rests = balance.at_rest(x, segment.tolerances[name], half)
+            segment.y[:, balance.at_edges(segment.rests, half)] = np.nan
+            segment.spread, segment.read_motion = half, recording.channels[spec.output]
         return segment
 
     def begins_with(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> npt.NDArray[np.intp]:
@@ -208,6 +214,12 @@ class AxisModel(Model):
                 segment.stages = stages(segment.inputs[self.spec.input], segment.substeps, hold)
             elif segment.balance is not None:
                 segment.balance = balance.held_as(segment.balance, segment, hold)
+
+    def along_motion(self) -> AxisModel | None:
+        """The same axis, compared by the force that its measured motion needs; None of a controller or an acceleration."""
+        if self.spec.controller is not None or self.spec.reads == "acceleration":
+            return None
+        return AxisModel(self.nominal, along=True) if self.free_run else self
 
     def guess(self, segments: list[Segment]) -> Array:
         """Equation-error estimate in the frequency domain where the TOML gives no value: U = (-w^2 m + i w c + k) X."""
@@ -299,6 +311,7 @@ class AxisModel(Model):
             if candidate.effect.slots is not None
         ]
         p = slot_array([*slots, {"stiffness": float(linear[2])}])
+        linear[2], p[SPRING] = linear[2] + p[SPRING], 0.0
         load = np.zeros(segment.n)
         if spec.controller is not None:
             c = spec.controller
@@ -329,16 +342,28 @@ class AxisModel(Model):
             segment.recording.dt_s,
             linear,
             p,
-            segment.begin.values,
+            self._begin(segment, active),
             load,
             control,
             reference,
             segment.start.get(spec.subsystem, 0.0),
             float(segment.recording.time_s[0]),
         )
-        motion = run[READ.index(spec.reads)]
+        motion = run[READ.index(self.reads)]
         motion = apply_effects(motion, active, f"{spec.subsystem}_reading", segment, None)
         return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]
+
+    def _begin(self, segment: AxisSegment, active: list[ActiveEffect]) -> Array:
+        """What the motion begins with (4,): where the effects on its reading, if affine, have what was read."""
+        assert segment.begin is not None
+        affine = [effect for effect in active if effect[0].effect.affine] if self.reads == "position" else []
+        if not affine:
+            return segment.begin.values
+        at_zero, at_one = apply_effects(np.array([0.0, 1.0]), affine, f"{self.spec.subsystem}_reading", segment, None)
+        gain = at_one - at_zero
+        begun = segment.begin.values.copy()
+        begun[0] -= at_zero
+        return begun / gain if gain != 0.0 else begun
 
     def noise_of(self, segment: Segment) -> Noise | None:
         """Noise of the force that a measured motion needs, from the spectra of both."""

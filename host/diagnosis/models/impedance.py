@@ -81,8 +81,7 @@ class ImpedanceModel(Model):
         self.parameters = tuple(parameters)
         # A constant force is an offset of the reading of force.
         self.taken = frozenset(("gravity_load:constant", *(("viscous_friction:",) if "damping" in self.spec.terms else ())))
-        if "stiffness" not in self.spec.terms:
-            self.taken |= {"contact_nonlinear:", "softening:"}
+        self.taken |= {"compliance:spring"} if "stiffness" in self.spec.terms else {"contact_nonlinear:", "softening:"}
         self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in (self.spec.input, *loads))
         self.unlisted_at = ((name, f"{name}_reading"),)
         self.moves = {name: self.spec.input}

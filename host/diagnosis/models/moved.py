@@ -12,7 +12,7 @@ from host.diagnosis.estimation.noise import estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.force_kernel import along, slot_array
 from host.diagnosis.model.model import ActiveEffect, Segment, tolerance_of
-from host.diagnosis.model.operators import least_error_window, smooth_derivatives, smoothing_window
+from host.diagnosis.model.operators import least_error_window, smooth_derivative, smoothing_window
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.03
@@ -54,7 +54,7 @@ class Moved:
             used = (1, 2) if clean else (0, 1, 2)  # a clean position is taken as it is
             best[-len(used) :] = [least_error_window(motion, recording.dt_s, noise, DEGREE, order) for order in used]
         windows = [max(min(one, widest), short) for one, short in zip(best, least, strict=True)]
-        x, v, a = (smooth_derivatives(motion, recording.dt_s, one, DEGREE)[k] for k, one in enumerate(windows))
+        x, v, a = (smooth_derivative(motion, recording.dt_s, one, order, DEGREE) for order, one in enumerate(windows))
         # smoothing a clean motion would round its reversals, and friction with them
         taken = (1 if clean else windows[0], windows[1], windows[2])
         return cls(motion if clean else x, v, a, tolerance, noise, taken)

@@ -149,7 +149,8 @@ class SimulatedModel(Model):
     scan_points = 24
     simulates = True
     either_sign = True
-    taken = frozenset({"gravity_load:constant"})  # a constant force along a motion is an offset of the reading of force
+    # A constant force along a motion is an offset of the reading of force; a simulator has the springs it has.
+    taken = frozenset({"gravity_load:constant", "compliance:spring"})
     inside: tuple[str, ...] = ()  # ports inside the simulator, whose effects `run_many` finds in a run
     shifted: bool = True  # whether a constant offset of an input is another one than that of a reading
 

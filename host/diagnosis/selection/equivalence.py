@@ -40,7 +40,7 @@ class Standing:
 
 def standings(problem: Problem, found: Found) -> list[Standing]:
     """For every effect of the best structure: its gain over the structure without it, and its equals."""
-    out = []
+    out, law = [], _with_law_alone(problem, found)
     for term in found.best.terms:
         begun = get_starts(problem)
         less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal, begin_again=True)
@@ -64,9 +64,25 @@ def standings(problem: Problem, found: Found) -> list[Standing]:
         alone = _rests_on(problem, less, found.best, term.fitted)
         # No inexact formula of another effect leaves a line that no motion has.
         doubtful = less.terms and not term.candidate.effect.memories
-        share = mismatch_removed(problem, found.nominal, less, found.best) if doubtful else np.inf
+        whole = found.nominal if term.candidate.effect.of_law else law
+        share = mismatch_removed(problem, whole, less, found.best) if doubtful else np.inf
         out.append(Standing(term.candidate, gain, both, alike, differences, term.fitted, share, alone, crossed is not None))
     return out
+
+
+def _with_law_alone(problem: Problem, found: Found) -> Fit:
+    """The nominal model with those effects of the best one that are terms of a law, which no formula idealizes.
+
+    What another effect removes is compared with what this leaves. Without its spring or damper, a law leaves so much that
+    everything else is small.
+    """
+    others = tuple(term.candidate.key for term in found.best.terms if not term.candidate.effect.of_law)
+    if not others or len(others) == len(found.best.terms):
+        return found.nominal
+    begun = get_starts(problem)
+    law = fit_without(problem, found.best, others, begin_again=True)
+    set_starts(problem, begun)
+    return law
 
 
 def most_probable(problem: Problem, found: Found) -> list[Standing]:

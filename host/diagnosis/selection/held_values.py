@@ -15,7 +15,7 @@ from host.diagnosis.model.readings import Finding
 from host.diagnosis.selection.found import Found
 
 Array = npt.NDArray[np.float64]
-DECADE = 10.0  # a value without bounds of its own is looked for between a tenth and ten times what is held
+FARTHEST = 100.0  # times what is held, or that part of it: where a value without bounds of its own is looked for
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ def held_values(spec: NominalSpec, problem: Problem) -> list[HeldValue]:
 
 
 def with_free(spec: NominalSpec, held: Sequence[HeldValue]) -> NominalSpec:
-    """`spec` with these values fitted, between its bounds or within a decade of what was held."""
+    """`spec` with these values fitted, between its bounds or within two decades of what was held."""
     parameters, effects = dict(spec.parameters), list(spec.effect)
     for each in held:
         if each.effect is not None:
             effects[each.effect] = effects[each.effect].model_copy(update={"free": True})
             continue
         given = parameters[each.name]
-        ends = sorted((given.value / DECADE, given.value * DECADE))
+        ends = sorted((given.value / FARTHEST, given.value * FARTHEST))
         low, high = (ends[k] if end is None else end for k, end in enumerate((given.low, given.high)))
         parameters[each.name] = given.model_copy(update={"free": True, "low": low, "high": high})
     return spec.model_copy(update={"parameters": parameters, "effect": effects})

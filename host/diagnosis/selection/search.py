@@ -29,7 +29,7 @@ from host.diagnosis.selection.joint import PairFit, best_pair, pair_first, pair_
 from host.diagnosis.selection.lost_steps import lost_steps, without_lost_steps
 from host.diagnosis.selection.refits import fit_nominal, fit_without, refined, settled, try_fit
 from host.diagnosis.selection.removal import drop_unsure, drop_unsure_events, prune, reduce
-from host.diagnosis.selection.restart import hidden
+from host.diagnosis.selection.restart import along_motion, hidden
 from host.diagnosis.selection.screening import Screened, above_noise, screen, term_of, without
 from host.diagnosis.selection.trial import (
     Trial,
@@ -129,6 +129,8 @@ def _grow(problem: Problem, found: Found, candidate_effects: list[Candidate], ea
         promising = worth_fitting(problem, best, ranked)
         if not best.terms:
             promising += hidden(problem, best, candidate_effects)
+        if above_noise(problem, best, rules.noise_uncertainty):
+            promising = along_motion(problem, best, candidate_effects, promising, progress)
         for count, item in enumerate(promising):
             if trials and problem.budget.spent():
                 break

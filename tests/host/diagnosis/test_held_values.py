@@ -9,47 +9,17 @@ import pytest
 from scipy.signal import lfilter
 
 import seldinger as sd
+from tests.host.diagnosis.shaken import shaken, tones
 from tests.host.proof import everyday as make
 from tests.host.proof.everyday import stream
 
 Array = np.ndarray
 Columns = dict[str, Array]
-DT_S, SAMPLES, STEPS = 0.01, 1500, 40  # steps of the simulation in one sample
 
 
 def held(value: float) -> dict[str, Any]:
     """A nominal value that is not to be fitted."""
     return {"value": value, "free": False}
-
-
-def tones(rng: np.random.Generator, t: Array, low_Hz: float, top_Hz: float) -> Array:
-    """Seven tones (n,) of equal size and an RMS of 1."""
-    f = np.geomspace(low_Hz, top_Hz, 7) * rng.uniform(0.93, 1.07, 7)
-    return np.sin(2 * np.pi * np.outer(t, f) + rng.uniform(0.0, 6.28, 7)) @ np.full(7, np.sqrt(2 / 7))
-
-
-def shaken(seed: int, stiffness: float = 900.0, friction: float = 0.0) -> list[Columns]:
-    """Three recordings of a mass of 2 kg with 15 N s/m, cut from motion, the force straight between samples.
-
-    Time steps in which dry friction takes as much of the speed as it can (Moreau 1988).
-    """
-    rng, out, h = stream(seed), [], DT_S / STEPS
-    for _ in range(3):
-        t = DT_S * np.arange(SAMPLES + 200)
-        f = 60.0 * tones(rng, t, 0.2, 5.0)
-        fine = np.interp(np.arange(0.5 * h, t[-1], h), t, f)
-        x, v, place = 0.0, 0.0, np.zeros(fine.size)
-        for k, force in enumerate(fine):
-            place[k] = x
-            free = (v * (1.0 - 0.5 * h * 7.5) + 0.5 * h * (force - stiffness * (x + 0.5 * h * v))) / (1.0 + 0.5 * h * 7.5)
-            slow = 0.5 * h * friction
-            faster = np.sign(free) * max(abs(free) - slow, 0.0)
-            x, v = x + 0.5 * h * (v + faster), faster
-        at = place[::STEPS]
-        keep = slice(200, at.size)
-        read = at + 2e-4 * rng.standard_normal(at.size)
-        out.append({"t": t[: at.size][keep] - t[200], "f": f[: at.size][keep], "x": read[keep]})
-    return out
 
 
 def axis(**parameters: Any) -> dict[str, Any]:
