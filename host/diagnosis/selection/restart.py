@@ -50,7 +50,7 @@ def along_motion(
     wrong ones. Without its spring, a mass is best left away. From there no single step leads back. Along the measured motion
     the law is linear in its coefficients.
     """
-    along = _along(problem)
+    along = _along(problem, base)
     if along is None:
         return promising
     fit = _astray(along, base, problem.rules)
@@ -62,9 +62,10 @@ def along_motion(
     found, cost = {item.candidate.key: item for item in promising}, robust(few.stacked(base.terms, base.values))[0]
     for item in ranked[: problem.rules.fits_per_step]:
         terms, values = without(fit, along, item.drop)
-        tried = [minimize(along, *_linearly(along, (*terms, item.term), np.append(values, begin))) for begin in item.begin]
+        terms = (*terms, item.term)
+        tried = [minimize(along, terms, _solved(along, terms, np.append(values, begin))) for begin in item.begin]
         best = min(tried, key=lambda each: each.cost)
-        if robust(few.stacked((*terms, item.term), best.values))[0] < cost:
+        if robust(few.stacked(terms, best.values))[0] < cost:
             nominal, begin = np.split(best.values, [values.size])
             so_far = without(base, problem, item.drop)[1]
             before = found.get(item.candidate.key, replace(item, begin=[], nominal=[]))
@@ -76,7 +77,7 @@ def along_motion(
     return list(found.values())
 
 
-def _along(problem: Problem) -> Problem | None:
+def _along(problem: Problem, base: Fit) -> Problem | None:
     """The recordings to screen by, compared along the measured motion; None where the model cannot."""
     model = problem.model.along_motion()
     if model is None or model is problem.model:
@@ -86,13 +87,14 @@ def _along(problem: Problem) -> Problem | None:
     if problem.model.holds:
         model.hold_as(segments, problem.model.hold)
     noise = next(noise for noise in map(model.noise_of, segments) if noise is not None)
-    return Problem(model, segments, [noise], np.ones(1), problem.columns, problem.rules)
+    along = Problem(model, segments, [noise], np.ones(1), problem.columns, problem.rules)
+    reweigh(along, Fit(base.terms, base.values))
+    return along
 
 
 def _astray(along: Problem, base: Fit, rules: SelectionRules) -> Fit | None:
     """The parameters of `base` fitted along the motion, if its own leave much more there, or have lost one; else None."""
-    reweigh(along, Fit(base.terms, base.values))
-    fit = minimize(along, *_linearly(along, base.terms, base.values))
+    fit = minimize(along, base.terms, _solved(along, base.terms, base.values))
     left = [along.stacked(base.terms, values) for values in (base.values, fit.values)]
     own, least = (float(r @ r) for r in left)
     lost = False
@@ -105,8 +107,8 @@ def _astray(along: Problem, base: Fit, rules: SelectionRules) -> Fit | None:
     return finish(along, fit) if lost or own > rules.astray_ratio**2 * least else None
 
 
-def _linearly(along: Problem, terms: tuple[Term, ...], values: Array) -> tuple[tuple[Term, ...], Array]:
-    """`terms`, and `values` with those solved for that the error is linear in, next to the others as they are."""
+def _solved(along: Problem, terms: tuple[Term, ...], values: Array) -> Array:
+    """`values` with those solved for in which the error along the motion is linear, next to the others as they are."""
     parameters, nominal = along.parameters(terms), len(along.model.parameters)
     linear = [k for k, p in enumerate(parameters) if p.high > p.low and (p.linear or k < nominal)]
     without_them = values.copy()
@@ -120,8 +122,8 @@ def _linearly(along: Problem, terms: tuple[Term, ...], values: Array) -> tuple[t
     size = np.linalg.norm(A, axis=0)
     bounds = [(max(p.low, 0.0) if p.log else p.low, p.high) for p in (parameters[k] for k in linear)]
     if not linear or not np.all(np.isfinite(A)) or not size.all():
-        return terms, values
+        return values
     low, high = (np.array(ends) * size for ends in zip(*bounds, strict=True))
     found = values.copy()
     found[linear] = lsq_linear(A / size, -left, (low, high)).x / size
-    return terms, found
+    return found

@@ -43,7 +43,7 @@ def sizes(content: dict[str, Any]) -> dict[str, dict[str, float]]:
         pytest.param((MASS, SPRING, OFFSET), "position", {"friction": 4.0}, [(*VISCOUS, 15.0), (*COULOMB, 4.0)], marks=LONG),
         pytest.param((MASS, SPRING, OFFSET), "position", {"cubic": 3e4}, [(*VISCOUS, 15.0), (*CUBIC, 3e4)], marks=LONG),
         pytest.param(
-            (MASS, DAMPER, OFFSET), "position", {"friction": 4.0}, [(*ELASTIC, 900.0), (*COULOMB, 4.0)], marks=SLOW
+            (MASS, DAMPER, OFFSET), "position", {"friction": 4.0}, [(*ELASTIC, 900.0), (*COULOMB, 4.0)], marks=LONG
         ),
         pytest.param(
             (MASS, DAMPER, SPRING),
