@@ -81,7 +81,11 @@ class ImpedanceModel(Model):
         self.parameters = tuple(parameters)
         # A constant force is an offset of the reading of force.
         self.taken = frozenset(("gravity_load:constant", *(("viscous_friction:",) if "damping" in self.spec.terms else ())))
-        self.taken |= {"compliance:spring"} if "stiffness" in self.spec.terms else {"contact_nonlinear:", "softening:"}
+        stiff = "stiffness" in self.spec.terms
+        if stiff or not {"mass", "damping"} & set(self.spec.terms):  # a load path is no law of motion without its spring
+            self.taken |= {"compliance:spring"}
+        if not stiff:
+            self.taken |= {"contact_nonlinear:", "softening:"}
         self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in (self.spec.input, *loads))
         self.unlisted_at = ((name, f"{name}_reading"),)
         self.moves = {name: self.spec.input}

@@ -98,7 +98,7 @@ def _astray(along: Problem, base: Fit, rules: SelectionRules) -> Fit | None:
     left = [along.stacked(base.terms, values) for values in (base.values, fit.values)]
     own, least = (float(r @ r) for r in left)
     lost = False
-    for index, p in enumerate(along.model.parameters):
+    for index, p in enumerate(along.model.inner.parameters):
         if p.log:
             away = fit.values.copy()
             away[index] = 0.0
@@ -109,8 +109,8 @@ def _astray(along: Problem, base: Fit, rules: SelectionRules) -> Fit | None:
 
 def _solved(along: Problem, terms: tuple[Term, ...], values: Array) -> Array:
     """`values` with those solved for in which the error along the motion is linear, next to the others as they are."""
-    parameters, nominal = along.parameters(terms), len(along.model.parameters)
-    linear = [k for k, p in enumerate(parameters) if p.high > p.low and (p.linear or k < nominal)]
+    parameters, law = along.parameters(terms), len(along.model.inner.parameters)
+    linear = [k for k, p in enumerate(parameters) if p.high > p.low and (p.linear or k < law)]
     without_them = values.copy()
     without_them[linear] = 0.0
     left, columns = along.stacked(terms, without_them), []

@@ -8,6 +8,11 @@ import numpy as np
 import pytest
 
 import seldinger as sd
+from host.diagnosis.model.nominal import effect_of, nominal_of
+from host.diagnosis.model.tables import table_of
+from host.diagnosis.problems import candidates_of, prepare
+from host.diagnosis.selection.refits import fit_nominal
+from host.diagnosis.selection.restart import along_motion
 from tests.host.diagnosis.shaken import shaken
 from tests.host.proof.everyday import axis_nominal
 
@@ -74,3 +79,15 @@ def test_a_constant_force_on_a_spring_is_as_well_an_offset_of_the_reading() -> N
     assert named["sensor_bias"]["parameters"]["offset_m"]["value"] == pytest.approx(-2.0 / 900.0, rel=0.02)
     assert named["coulomb_friction"]["parameters"]["force_N"]["value"] == pytest.approx(4.0, rel=0.02)
     assert np.isclose(content["fit"]["nominal_parameters"]["stiffness_N_per_m"]["value"], 900.0, rtol=0.01)
+
+
+def test_starts_along_the_motion_leave_the_time_constant_of_a_known_lag_alone() -> None:
+    """The error is not linear in it: it was set to zero for a column of the least squares, and divided by."""
+    spec = nominal_of(axis_nominal(terms=(MASS, DAMPER, OFFSET)))
+    spec.effect += [effect_of("rate_lag@slide:time_constant_s=0.002")]
+    tables = [table_of(columns, number) for number, columns in enumerate(shaken(832))]
+    problem = prepare(spec, tables)[1]
+    springs = [c for c in candidates_of(problem, frozenset()) if c.key == "compliance@slide(spring)"]
+    (start,) = along_motion(problem, fit_nominal(problem), springs, [], lambda what, part: None)
+    assert start.begin[0] == pytest.approx(900.0, rel=0.02) and start.nominal[0][0] == pytest.approx(2.0, rel=0.02)
+    assert np.all(np.isfinite(start.nominal[0]))
