@@ -82,7 +82,7 @@ class ImpedanceModel(Model):
         # A constant force is an offset of the reading of force.
         self.taken = frozenset(("gravity_load:constant", *(("viscous_friction:",) if "damping" in self.spec.terms else ())))
         stiff = "stiffness" in self.spec.terms
-        if stiff or not {"mass", "damping"} & set(self.spec.terms):  # a load path is no law of motion without its spring
+        if stiff or not {"mass", "damping"} & set(self.spec.terms):  # a path of load needs no spring
             self.taken |= {"compliance:spring"}
         if not stiff:
             self.taken |= {"contact_nonlinear:", "softening:"}
