@@ -63,7 +63,9 @@ def along_motion(
     for item in ranked[: problem.rules.fits_per_step]:
         terms, values = without(fit, along, item.drop)
         terms = (*terms, item.term)
-        tried = [minimize(along, terms, _solved(along, terms, np.append(values, begin))) for begin in item.begin]
+        begins = [_solved(along, terms, np.append(values, begin)) for begin in item.begin]
+        rounds = problem.rules.first_iterations  # all that is linear is at its place already
+        tried = [minimize(along, terms, begin, rounds=rounds, tolerance=1e-4) for begin in begins]
         best = min(tried, key=lambda each: each.cost)
         if robust(few.stacked(terms, best.values))[0] < cost:
             nominal, begin = np.split(best.values, [values.size])
