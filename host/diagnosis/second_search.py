@@ -197,13 +197,18 @@ def _without_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -
     return freed if score >= enough else []
 
 
+def _next_to(second: Problem, base: Fit, starts: list[dict[str, float]]) -> Fit:
+    """`base` fitted again in `second`, which fits a held value, from the same starts of memory."""
+    set_starts(second, starts)
+    return refined(second, minimize(second, base.terms, base.values))
+
+
 def _gains(again: Again, begun: Searched, each: HeldValue) -> bool:
     """Whether fitting a held value next to all that was found takes enough from what they leave to search again."""
-    problem, best, begin = begun.problem, begun.found.best, get_starts(begun.problem)
+    problem, best = begun.problem, begun.found.best
     second, _ = _problems_of(with_free(again.spec, [each]), again, begun)
     fit_nominal(second)
-    set_starts(second, begin)
-    fit = refined(second, minimize(second, best.terms, best.values))
+    fit = _next_to(second, best, get_starts(problem))
     gain = problem.gain("both", best.residuals, fit.residuals)
     return gain.log_likelihood > problem.rules.pooled_log_likelihood and gain.p_value < problem.rules.significance
 
@@ -239,8 +244,7 @@ def _next_to_effects(again: Again, begun: Searched, held: Sequence[HeldValue]) -
                 freed[each.name] = spec, _problems_of(spec, again, begun)[0]
                 fit_nominal(freed[each.name][1])
             spec, second = freed[each.name]
-            set_starts(second, starts)
-            fit = refined(second, minimize(second, base.terms, base.values))
+            fit = _next_to(second, base, starts)
             if _likelier(begun, fit, [each]) and _plausible(spec, second, fit, [each]):
                 set_starts(problem, before)
                 return [each]

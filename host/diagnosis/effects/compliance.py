@@ -21,7 +21,7 @@ def spring(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Force per deflection."""
+    """Return what the force kernel takes: the stiffness of a spring between the moving part and a fixed place."""
     return {"spring": p[0]}
 
 

@@ -277,6 +277,18 @@ def apply_effects(
     return signal
 
 
+def affine_reading(segment: Segment, active: list[ActiveEffect], port: str) -> tuple[float, float] | None:
+    """Offset and gain of the affine effects on the reading at `port`, by which a state that is read begins elsewhere.
+
+    None where there is no such effect, or none that can be undone (gain 0).
+    """
+    affine = [effect for effect in active if effect[0].effect.affine and effect[0].port.name == port]
+    if not affine:
+        return None
+    at_zero, at_one = map(float, apply_effects(np.array([0.0, 1.0]), affine, port, segment, None))
+    return (at_zero, at_one - at_zero) if at_one != at_zero else None
+
+
 def _finer(time_s: Array, dt_s: float, finer: int) -> Array:
     if finer == 1:
         return time_s

@@ -20,6 +20,7 @@ from host.diagnosis.model.model import (
     Model,
     Output,
     Segment,
+    affine_reading,
     apply_effects,
     filled,
     stack,
@@ -311,6 +312,7 @@ class AxisModel(Model):
             if candidate.effect.slots is not None
         ]
         p = slot_array([*slots, {"stiffness": float(linear[2])}])
+        # A spring that the law lacks counts as its own would: under the test function, not along the smoothed motion.
         linear[2], p[SPRING] = linear[2] + p[SPRING], 0.0
         load = np.zeros(segment.n)
         if spec.controller is not None:
@@ -356,14 +358,12 @@ class AxisModel(Model):
     def _begin(self, segment: AxisSegment, active: list[ActiveEffect]) -> Array:
         """What the motion begins with (4,): where the effects on its reading, if affine, have what was read."""
         assert segment.begin is not None
-        affine = [effect for effect in active if effect[0].effect.affine] if self.reads == "position" else []
-        if not affine:
+        reads_place = self.reads == "position"
+        affine = affine_reading(segment, active, f"{self.spec.subsystem}_reading") if reads_place else None
+        if affine is None:
             return segment.begin.values
-        at_zero, at_one = apply_effects(np.array([0.0, 1.0]), affine, f"{self.spec.subsystem}_reading", segment, None)
-        gain = at_one - at_zero
-        begun = segment.begin.values.copy()
-        begun[0] -= at_zero
-        return begun / gain if gain != 0.0 else begun
+        offset, gain = affine
+        return (segment.begin.values - np.array([offset, 0.0, 0.0, 0.0])) / gain
 
     def noise_of(self, segment: Segment) -> Noise | None:
         """Noise of the force that a measured motion needs, from the spectra of both."""

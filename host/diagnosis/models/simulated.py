@@ -41,6 +41,7 @@ from host.diagnosis.model.model import (
     Model,
     Output,
     Segment,
+    affine_reading,
     apply_effects,
     filled,
     stack,
@@ -429,12 +430,11 @@ class SimulatedModel(Model):
 
     def _undo(self, segment: Segment, initial: dict[str, float], active: list[ActiveEffect]) -> None:
         """Let each output and its rate begin where the effects on its reading, if affine, have what was read."""
-        affine = [effect for effect in active if effect[0].effect.affine]
-        for name in self.section.outputs if affine else ():
-            if name in initial:
-                at_zero, at_one = apply_effects(np.array([0.0, 1.0]), affine, f"{name}_reading", segment, None)
-                gain = float(at_one - at_zero)
-                initial[name] = (initial[name] - float(at_zero)) / gain
+        for name in self.section.outputs:
+            affine = affine_reading(segment, active, f"{name}_reading") if name in initial else None
+            if affine is not None:
+                offset, gain = affine
+                initial[name] = (initial[name] - offset) / gain
                 if f"{name}_rate" in initial:
                     initial[f"{name}_rate"] /= gain
 
